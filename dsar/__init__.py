@@ -1,0 +1,27 @@
+"""DSAR: Gaussian avatars whose clothes have memory.
+
+Everything is imported on first use: `import dsar` alone is cheap.
+"""
+
+from importlib import import_module
+from typing import Any
+
+_PUBLIC = {
+    "open_capture": "dsar.data.capture",
+    "train": "dsar.training.loop",
+    "load": "dsar.training.checkpoint",
+    "roll_out": "dsar.avatar.rollout",
+    "rasterize": "dsar.raster",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public function when it is first asked for."""
+    if name not in _PUBLIC:
+        raise AttributeError(f"module 'dsar' has no attribute {name!r}")
+    return getattr(import_module(_PUBLIC[name]), name)
+
+
+def __dir__() -> list[str]:
+    """List the public functions."""
+    return sorted(_PUBLIC)

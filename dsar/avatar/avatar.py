@@ -1,0 +1,187 @@
+"""The avatar: template, network and skeleton; one step of it makes one frame of posed Gaussians."""
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor, nn
+
+from dsar.avatar.garment import fit_garment_chart
+from dsar.avatar.posing import pose_gaussians
+from dsar.avatar.stillness import stillest_frames
+from dsar.avatar.template import GaussianParameters
+from dsar.body.atlas import Atlas, body_chart
+from dsar.body.model import PARENTS, Body
+from dsar.body.skinning import forward_kinematics
+from dsar.config import AtlasConfig, ModelConfig
+from dsar.geometry.rotations import heading_matrix
+from dsar.network import DualStreamNetwork, NetworkOutput, NetworkState
+from dsar.network.maps import FrameMaps, maps_from_points
+from dsar.types import Capture, Gaussians, Motion
+
+GARMENT_FRAMES = 12
+"""Still frames whose masks shape the garment chart."""
+
+
+class Avatar(nn.Module):
+    """A person who can be driven by any SMPL-X motion.
+
+    A *track* is a motion as T_world_rest of every joint per frame; a *context* holds the transforms of
+    a frame, of the one before and of the one before that, newest first.
+    """
+
+    texels: Tensor
+    texel_weights: Tensor
+    cells: Tensor
+    control_points: Tensor
+    control_weights: Tensor
+    map_mean: Tensor
+    map_scale: Tensor
+    speed_scale: Tensor
+    body_joints: Tensor
+
+    def __init__(self, body: Body, atlas: Atlas, model: ModelConfig, fps: float) -> None:
+        super().__init__()
+        self.model, self.fps = model, fps
+        for name in ("vertices", "faces", "joints", "weights", "uv", "uv_faces"):
+            self.register_buffer(f"body_{name}", getattr(body, name))
+        self.atlas_size = (atlas.height, atlas.width)
+        self.register_buffer("texels", atlas.texels)
+        self.register_buffer("texel_positions", atlas.positions)
+        self.register_buffer("texel_weights", atlas.weights)
+        size = (atlas.height // model.upsample, atlas.width // model.upsample)
+        cells, nearest = grid_cells(atlas, model.upsample)
+        self.grid_size = size
+        self.register_buffer("cells", cells)
+        self.register_buffer("control_points", atlas.positions[nearest])
+        self.register_buffer("control_weights", atlas.weights[nearest])
+        self.register_buffer("map_mean", torch.zeros(model.map_channels, 1, 1))
+        self.register_buffer("map_scale", torch.ones(model.map_channels, 1, 1))
+        self.register_buffer("speed_scale", torch.ones(()))
+        occupied = torch.zeros(size[0] * size[1], dtype=torch.bool)
+        occupied[cells] = True
+        self.template = GaussianParameters(atlas.positions, model.sh_degree)
+        self.network = DualStreamNetwork(model, occupied.reshape(size))
+
+    @classmethod
+    def from_capture(cls, capture: Capture, body: Body, atlas: AtlasConfig, model: ModelConfig) -> "Avatar":
+        """Build an untrained avatar: atlas from body and silhouettes, input statistics from the motions."""
+        motions = {name: capture.motions[name] for name in capture.splits["train"]}
+        fps = next(iter(motions.values())).fps
+        tracks = {n: forward_kinematics(body, m.rotations, m.translations) for n, m in motions.items()}
+        charts = [body_chart(body, atlas.resolution)]
+        if atlas.garment == "auto":
+            still = stillest_frames(tracks, fps, GARMENT_FRAMES, per_sequence=3)
+            pelvis = torch.stack([tracks[name][frame, 0] for name, frame in still])
+            size = (atlas.garment_rows, atlas.resolution)
+            chart = fit_garment_chart(body, capture, still, pelvis, size, atlas.weight_smoothing)
+            charts += [chart] if chart is not None else []
+        avatar = cls(body, Atlas.stack(charts), model, fps)
+        avatar.measure_maps(list(tracks.values()))
+        return avatar
+
+    @property
+    def body(self) -> Body:
+        """The shaped body that drives the avatar."""
+        names = ("vertices", "faces", "joints", "weights", "uv", "uv_faces")
+        return Body(parents=PARENTS, **{name: getattr(self, f"body_{name}") for name in names})
+
+    @property
+    def num_gaussians(self) -> int:
+        """Gaussians of every frame."""
+        return len(self.texels)
+
+    def track(self, motion: Motion) -> Float[Tensor, "f j 4 4"]:
+        """Return T_world_rest of every joint and frame of a motion."""
+        return forward_kinematics(self.body, motion.rotations, motion.translations)
+
+    def start(self, batch: int = 1) -> NetworkState:
+        """Return the state of rollouts that have seen nothing yet."""
+        return self.network.start(batch)
+
+    def maps(self, context: Float[Tensor, "b 3 j 4 4"], fps: float) -> FrameMaps:
+        """Return the network's input maps, in metres, of frames given with their two predecessors."""
+        blended = blend(self.control_weights, context)
+        points = (blended[..., :3] * self.control_points[:, None, :]).sum(-1) + blended[..., 3]
+        pelvis = context[:, 0, 0]
+        roots = pelvis[:, :3, :3] @ self.body_joints[0] + pelvis[:, :3, 3]
+        return maps_from_points(
+            points,
+            heading_matrix(pelvis[:, :3, :3]),
+            roots,
+            self.cells,
+            self.grid_size,
+            fps,
+            velocity=self.model.velocity,
+            acceleration=self.model.acceleration,
+        )
+
+    @torch.no_grad()
+    def measure_maps(self, tracks: list[Float[Tensor, "f j 4 4"]]) -> None:
+        """Set the statistics that standardise input maps from training motions."""
+        maps, speeds = [], []
+        for track in tracks:
+            for frames in torch.arange(0, len(track), 4).split(16):
+                observed = self.maps(contexts(track, frames), self.fps)
+                maps.append(observed.maps.flatten(2)[:, :, self.cells])
+                speeds.append(observed.speed.flatten(2)[:, :, self.cells])
+        values = torch.cat(maps)
+        # Positions are centred; velocities and accelerations keep their zero, which means rest.
+        self.map_mean[:3] = values[:, :3].mean((0, 2))[:, None, None]
+        deviation = (values - self.map_mean[:, 0]).square().mean((0, 2)).sqrt()
+        self.map_scale.copy_(deviation.clamp_min(1e-3)[:, None, None])
+        self.speed_scale.copy_(torch.cat(speeds).square().mean().sqrt().clamp_min(1e-3))
+
+    def advance(
+        self, context: Float[Tensor, "b 3 j 4 4"], state: NetworkState, *, streams: bool = True
+    ) -> tuple[NetworkOutput, NetworkState, FrameMaps]:
+        """Run the network one frame on; return its output, the next state and the maps it saw."""
+        observed = self.maps(context, self.fps)
+        maps = (observed.maps - self.map_mean) / self.map_scale * self.network.occupied
+        output, state = self.network(maps, observed.speed / self.speed_scale, state, streams=streams)
+        return output, state, observed
+
+    def gaussians(self, context: Float[Tensor, "b 3 j 4 4"], output: NetworkOutput | None) -> list[Gaussians]:
+        """Return the posed Gaussians of each batch entry; without an output, the template's."""
+        if output is None:
+            canonical = self.template.activate()
+        else:
+            offset, appearance = self.at_texels(output.offset), self.at_texels(output.appearance)
+            canonical = self.template.activate(offset, appearance)
+        return pose_gaussians(canonical, blend(self.texel_weights, context[:, :1])[:, 0])
+
+    def step(
+        self, context: Float[Tensor, "b 3 j 4 4"], state: NetworkState
+    ) -> tuple[list[Gaussians], NetworkState]:
+        """Advance rollouts by one frame: posed Gaussians of each, and the state to carry on."""
+        output, state, _ = self.advance(context, state)
+        return self.gaussians(context, output), state
+
+    def at_texels(self, maps: Float[Tensor, "b c h w"]) -> Float[Tensor, "b n c"]:
+        """Return map values at every Gaussian's texel, bilinear between the network's pixels."""
+        if self.model.upsample > 1:
+            maps = nn.functional.interpolate(maps, size=self.atlas_size, mode="bilinear")
+        return maps.flatten(2)[:, :, self.texels].transpose(1, 2)
+
+
+def blend(
+    weights: Float[Tensor, "n j"], transforms: Float[Tensor, "b f j 4 4"]
+) -> Float[Tensor, "b f n 3 4"]:
+    """Return the blended bone transforms of points, by frame."""
+    return (weights @ transforms[..., :3, :].flatten(3)).unflatten(-1, (3, 4))
+
+
+def contexts(track: Float[Tensor, "f j 4 4"], frames: Int64[Tensor, " b"]) -> Float[Tensor, "b 3 j 4 4"]:
+    """Return frames with their two predecessors, newest first; the first frame precedes itself."""
+    index = (frames[:, None] - torch.arange(3)).clamp_min(0)
+    return track[index]
+
+
+def grid_cells(atlas: Atlas, upsample: int) -> tuple[Int64[Tensor, " p"], Int64[Tensor, " p"]]:
+    """Return the network pixels that hold texels, and of each the texel nearest to its centre."""
+    rows, columns = atlas.texels // atlas.width, atlas.texels % atlas.width
+    width = atlas.width // upsample
+    cell = rows // upsample * width + columns // upsample
+    center = (upsample - 1) / 2
+    distance = (rows % upsample - center).square() + (columns % upsample - center).square()
+    order = (cell.double() * 1e6 + distance).argsort(stable=True)
+    cells, counts = cell[order].unique_consecutive(return_counts=True)
+    return cells, order[counts.cumsum(0) - counts]

@@ -1,0 +1,177 @@
+"""A chart of the atlas for loose cloth, fitted to the visual hull where it stands off the body.
+
+On bare skin texels a skirt tears into shorts when the legs part; a closed tube of texels from the
+waist to the hem, carried by heavily smoothed skin weights, does not.
+"""
+
+import logging
+import math
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from dsar.body.atlas import Chart
+from dsar.body.model import JOINT_NAMES, Body
+from dsar.geometry.cameras import project
+from dsar.types import Capture
+
+LOGGER = logging.getLogger(__name__)
+
+LOOSE = 0.03
+"""Metres by which a hull must stand off the body, in the median over azimuth, to count as loose."""
+SHORTEST = 0.10
+"""Metres of loose height below which no chart is worth having."""
+STEP = 0.0125
+"""Metres between samples along a radius and between heights."""
+REACH = 0.7
+"""Metres from the body's axis that the search covers."""
+AZIMUTHS = 64
+"""Directions sampled around the axis."""
+_ARMS = ("collar", "shoulder", "elbow", "wrist", "index", "middle", "pinky", "ring", "thumb")
+
+
+def fit_garment_chart(
+    body: Body,
+    capture: Capture,
+    frames: list[tuple[str, int]],
+    pelvis: Float[Tensor, "f 4 4"],
+    size: tuple[int, int],
+    smoothing: float,
+) -> Chart | None:
+    """Return a tube of size (rows, columns) around the loose garment, or None where there is none.
+
+    `frames` should be still; `pelvis` is T_world_rest of the pelvis in each. Columns go once around, from
+    the back over the right side, the front and the left side to the back; rows from waist to hem.
+    """
+    heights = torch.arange(float(body.joints[JOINT_NAMES.index("left_ankle"), 1]), _chest(body), STEP)
+    hull = hull_radii(capture, frames, pelvis, body.joints[0], heights)
+    slack = hull - body_radii(body, heights)
+    extent = loose_extent(heights, slack.median(1).values)
+    if extent is None:
+        LOGGER.info("no loose garment found: the atlas is the body's alone")
+        return None
+    hem, waist = extent
+    rows = torch.linspace(waist, hem, size[0])
+    azimuths = _azimuths(size[1])
+    radii = _resample(hull, heights, rows, size[1])
+    directions = torch.stack([azimuths.sin(), torch.zeros_like(azimuths), azimuths.cos()], -1)
+    axis = torch.stack([body.joints[0, 0].expand(size[0]), rows, body.joints[0, 2].expand(size[0])], -1)
+    positions = (axis[:, None] + radii[..., None] * directions).reshape(-1, 3)
+    LOGGER.info(
+        "loose garment found: %.2f m from waist to hem, mean hem radius %.2f m", waist - hem, radii[-1].mean()
+    )
+    return Chart(torch.ones(size, dtype=torch.bool), positions, diffuse_weights(body, positions, smoothing))
+
+
+def hull_radii(
+    capture: Capture,
+    frames: list[tuple[str, int]],
+    pelvis: Float[Tensor, "f 4 4"],
+    center: Float[Tensor, "3"],
+    heights: Float[Tensor, " y"],
+) -> Float[Tensor, "y a"]:
+    """Return how far the visual hull reaches from the pelvis axis per height and azimuth, metres.
+
+    Of all frames the lower quartile is taken: arms and swinging cloth come and go, cloth at rest stays.
+    """
+    azimuths = _azimuths(AZIMUTHS)
+    radii = torch.arange(0.0, REACH, STEP)
+    directions = torch.stack([azimuths.sin(), torch.zeros_like(azimuths), azimuths.cos()], -1)
+    axis = torch.stack([center[0].expand(len(heights)), heights, center[2].expand(len(heights))], -1)
+    samples = axis[:, None, None] + radii[:, None] * directions[None, :, None]
+    reach = []
+    for (sequence, frame), transform in zip(frames, pelvis, strict=True):
+        world = samples @ transform[:3, :3].T + transform[:3, 3]
+        inside = torch.ones(world.shape[:-1], dtype=torch.bool)
+        for index, camera in enumerate(capture.cameras):
+            mask = torch.from_numpy(capture.image(sequence, frame, index)[..., 3] > 127)
+            pixels, depth = project(camera, world)
+            inside &= _lookup(mask, pixels) & (depth > 0)
+        reach.append(inside.cumprod(-1).sum(-1) * STEP)
+    return torch.stack(reach).quantile(0.25, dim=0)
+
+
+def body_radii(body: Body, heights: Float[Tensor, " y"]) -> Float[Tensor, "y a"]:
+    """Return how far the resting body, without its arms, reaches from the pelvis axis, metres."""
+    vertices = body.vertices[~_is_arm(body)]
+    offset = vertices - body.joints[0]
+    azimuth = torch.atan2(offset[:, 0], offset[:, 2])
+    column = ((azimuth + math.pi) / (2 * math.pi) * AZIMUTHS).long().clamp(0, AZIMUTHS - 1)
+    distance = offset[:, [0, 2]].norm(dim=1)
+    radii = torch.zeros(len(heights), AZIMUTHS)
+    for row, height in enumerate(heights):
+        near = (vertices[:, 1] - height).abs() < 2 * STEP
+        radii[row].scatter_reduce_(0, column[near], distance[near], "amax")
+    return radii
+
+
+def loose_extent(heights: Float[Tensor, " y"], slack: Float[Tensor, " y"]) -> tuple[float, float] | None:
+    """Return (hem, waist) of the longest loose run of heights, the waist where the slack ends."""
+    loose = (slack > LOOSE).tolist()
+    runs, start = [], None
+    for i, flag in enumerate([*loose, False]):
+        if flag and start is None:
+            start = i
+        if not flag and start is not None:
+            runs.append((start, i - 1))
+            start = None
+    if not runs:
+        return None
+    low, high = max(runs, key=lambda run: run[1] - run[0])
+    if float(heights[high] - heights[low]) < SHORTEST:
+        return None
+    while high + 1 < len(slack) and slack[high + 1] > LOOSE / 3 and slack[high + 1] <= slack[high]:
+        high += 1
+    return float(heights[low]), float(heights[high])
+
+
+def diffuse_weights(body: Body, points: Float[Tensor, "n 3"], sigma: float) -> Float[Tensor, "n j"]:
+    """Return skin weights of points off the body: a Gaussian-weighted mean of the body's, arms left out.
+
+    `sigma` in metres says how far a thigh's pull spreads over the cloth.
+    """
+    keep = ~_is_arm(body)
+    vertices, weights = body.vertices[keep], body.weights[keep]
+    squared = torch.cdist(points, vertices).square()
+    nearest = squared.amin(1, keepdim=True)
+    kernel = torch.exp((nearest - squared) / (2 * max(sigma, 1e-3) ** 2))
+    blended = kernel @ weights
+    return blended / blended.sum(1, keepdim=True)
+
+
+def _is_arm(body: Body) -> Bool[Tensor, " v"]:
+    arm = torch.tensor([any(part in name for part in _ARMS) for name in JOINT_NAMES])
+    return body.weights[:, arm].sum(1) > 0.5
+
+
+def _chest(body: Body) -> float:
+    return float(body.joints[JOINT_NAMES.index("spine2"), 1])
+
+
+def _azimuths(count: int) -> Float[Tensor, " a"]:
+    """Return bin centres from the back (-pi) over -X, the front (0) and +X to the back again."""
+    return (torch.arange(count) + 0.5) / count * 2 * math.pi - math.pi
+
+
+def _lookup(mask: Bool[Tensor, "h w"], pixels: Float[Tensor, "*b 2"]) -> Bool[Tensor, " *b"]:
+    h, w = mask.shape
+    x, y = pixels[..., 0].floor().long(), pixels[..., 1].floor().long()
+    valid = (x >= 0) & (x < w) & (y >= 0) & (y < h)
+    return mask[y.clamp(0, h - 1), x.clamp(0, w - 1)] & valid
+
+
+def _resample(
+    hull: Float[Tensor, "y a"], heights: Float[Tensor, " y"], rows: Float[Tensor, " r"], columns: int
+) -> Float[Tensor, "r c"]:
+    """Return the hull at the chart's rows and columns, smoothed over azimuth and height."""
+    span = (rows - heights[0]) / (heights[-1] - heights[0]) * 2 - 1
+    wrapped = torch.cat([hull[:, -4:], hull, hull[:, :4]], 1)
+    smooth = torch.nn.functional.avg_pool2d(wrapped[None, None], (5, 5), 1, (2, 2), count_include_pad=False)
+    # Columns in units of the wrapped grid's pixels, then in grid_sample's [-1, 1].
+    column = (torch.arange(columns) + 0.5) / columns * AZIMUTHS + 4
+    across = column / (AZIMUTHS + 8) * 2 - 1
+    grid = torch.stack(torch.meshgrid(span, across, indexing="ij"), -1).flip(-1)
+    height_scale = (len(heights) - 1) / len(heights)
+    grid = grid * grid.new_tensor([1.0, height_scale])
+    return torch.nn.functional.grid_sample(smooth, grid[None], align_corners=False)[0, 0]

@@ -1,0 +1,75 @@
+"""Drive an avatar through a motion, one frame in memory at a time."""
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dsar.avatar.avatar import Avatar, contexts
+from dsar.errors import MotionError
+from dsar.types import Gaussians, GaussianSequence, Motion
+
+START_FRAME = 1001
+"""Number of a motion's first frame, as film pipelines count."""
+
+
+def roll_out(
+    avatar: Avatar,
+    motion: Motion,
+    *,
+    frames: Sequence[int] | None = None,
+    provenance: dict[str, str] | None = None,
+) -> GaussianSequence:
+    """Return the avatar's posed Gaussians over a motion at the avatar's frame rate.
+
+    Every frame up to the last requested one is computed, since each follows from the one before;
+    only those in `frames` (numbers from 1001 on; None: all) are yielded.
+
+    Raises:
+        MotionError: the rate is not the avatar's, or a requested frame lies outside the motion.
+    """
+    if abs(motion.fps - avatar.fps) > 1e-3:
+        raise MotionError(
+            f"motion {motion.name} has {motion.fps:g} fps, the avatar {avatar.fps:g}; resample it"
+        )
+    last = START_FRAME + len(motion) - 1
+    numbers = list(frames) if frames is not None else list(range(START_FRAME, last + 1))
+    outside = [n for n in numbers if not START_FRAME <= n <= last]
+    if outside or not numbers:
+        raise MotionError(
+            f"frame {outside[0] if outside else 'range'} is outside motion {motion.name}, "
+            f"which has frames {START_FRAME}-{last}"
+        )
+    numbers = sorted(set(numbers))
+    return GaussianSequence(
+        frame_numbers=numbers,
+        fps=avatar.fps,
+        num_gaussians=avatar.num_gaussians,
+        produce=lambda: _produce(avatar, avatar.track(motion), {n - START_FRAME for n in numbers}),
+        provenance={"motion": motion.name, **(provenance or {})},
+    )
+
+
+def template_sequence(sequence: GaussianSequence, avatar: Avatar, motion: Motion) -> GaussianSequence:
+    """Return the same frames of the template under skinning alone: the baseline without a network."""
+    track = avatar.track(motion)
+
+    @torch.no_grad()
+    def produce() -> Iterator[Gaussians]:
+        for number in sequence.frame_numbers:
+            yield avatar.gaussians(contexts(track, torch.tensor([number - START_FRAME])), None)[0]
+
+    return dataclasses.replace(sequence, produce=produce)
+
+
+def _produce(avatar: Avatar, track: Float[Tensor, "f j 4 4"], wanted: set[int]) -> Iterator[Gaussians]:
+    state = avatar.start()
+    for frame in range(max(wanted) + 1):
+        with torch.no_grad():
+            context = contexts(track, torch.tensor([frame]))
+            output, state, _ = avatar.advance(context, state)
+            made = avatar.gaussians(context, output)[0] if frame in wanted else None
+        if made is not None:
+            yield made

@@ -1,0 +1,37 @@
+"""Frames in which the cloth can be taken to hang at rest."""
+
+import torch
+from jaxtyping import Float, Float32
+from torch import Tensor
+
+SETTLE_SECONDS = 1.0
+"""Cloth is taken to be at rest when the body has hardly moved for this long."""
+
+
+def restlessness(joints: Float[Tensor, "f j 3"], fps: float) -> Float[Tensor, " f"]:
+    """Return the largest mean joint speed (m/s) of the last second at each frame.
+
+    Before the first frame the body is taken to have stood still.
+    """
+    speed = torch.zeros(len(joints))
+    speed[1:] = (joints[1:] - joints[:-1]).norm(dim=-1).mean(-1) * fps
+    length = round(SETTLE_SECONDS * fps)
+    padded = torch.cat([torch.zeros(length - 1), speed])
+    return padded.unfold(0, length, 1).amax(-1)
+
+
+def stillest_frames(
+    tracks: dict[str, Float32[Tensor, "f j 4 4"]], fps: float, count: int, per_sequence: int
+) -> list[tuple[str, int]]:
+    """Return the `count` stillest frames, at most `per_sequence` from any sequence.
+
+    `tracks` holds T_world_rest of the joints for each frame of each sequence.
+    """
+    candidates = []
+    for name, track in tracks.items():
+        # Where the transforms carry two points tells how fast each joint translates and turns.
+        heads = track[:, :, :3, 3] + track[:, :, :3, :3].sum(-1) * 0.3
+        scores = restlessness(heads, fps)
+        best = scores.argsort(stable=True)[:per_sequence]
+        candidates += [(float(scores[i]), name, int(i)) for i in best]
+    return [(name, frame) for _, name, frame in sorted(candidates)[:count]]

@@ -1,0 +1,234 @@
+"""Every setting of a run, its unit and its default, and the presets.
+
+A run's config.json is exactly a `TrainConfig`. The preset `paper` holds the paper's values
+(section 4.1); fields marked *extension* have no counterpart there and are off in it.
+"""
+
+import dataclasses
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from dsar.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class AtlasConfig:
+    """The grid of texels, one Gaussian each."""
+
+    resolution: int = 96
+    """Side of the body's UV square in texels."""
+    garment: Literal["auto", "off"] = "auto"
+    """`auto` adds a chart fitted to the visual hull where cloth stands off the body (extension)."""
+    garment_rows: int = 48
+    """Height of the garment chart in texels; its width is `resolution`."""
+    weight_smoothing: float = 0.12
+    """Standard deviation in metres of the kernel that smooths the garment chart's skin weights."""
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """The network."""
+
+    wiring: Literal["shared", "perframe"] = "perframe"
+    """`shared` feeds the previous offset to every frame of the window (the paper: n encodings a step);
+    `perframe` gives each frame the offset that preceded it (one encoding a step)."""
+    window: int = 5
+    """Frames n that the network sees, the current one included."""
+    memory: int = 6
+    """Hidden states m in the memory bank; 0 removes the state stream."""
+    feedback: bool = True
+    """Feed the previous offset back (the geometric stream)."""
+    velocity: bool = True
+    """Feed velocity maps."""
+    acceleration: bool = True
+    """Feed acceleration maps (extension; it nearly halves the error of driven cloth)."""
+    motion_embedding: bool = True
+    """Add the embedding of the motion magnitude to the deepest features."""
+    channels: tuple[int, ...] = (32, 64, 96)
+    """Encoder channels, finest level first; every further level halves the resolution."""
+    heads: int = 4
+    """Attention heads of both attentions."""
+    upsample: int = 4
+    """Atlas texels per network pixel, each way (1: the paper's)."""
+    identity_channels: int = 8
+    """Channels of a learnt static map that tells pixels apart (extension)."""
+    recall: float = 0.5
+    """Initial lambda: the share of the memory in the hidden state."""
+    offset_scale: float = 0.3
+    """Metres of offset for a unit output."""
+    offset_limit: float = 0.5
+    """Metres beyond which a loose tanh holds the offset."""
+    sh_degree: int = 0
+    """Degree of the spherical harmonics, 0-3."""
+
+    @property
+    def map_channels(self) -> int:
+        """Channels of a frame's input maps without feedback: position, velocity, acceleration."""
+        return 3 + 3 * self.velocity + 3 * self.acceleration
+
+    @property
+    def appearance_channels(self) -> int:
+        """Channels of the residuals besides the offset: quaternion, log-scale, logit, harmonics."""
+        return 4 + 3 + 1 + 3 * (self.sh_degree + 1) ** 2
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """Weights of the losses; image losses are means over pixels, temporal ones means over elements."""
+
+    l1: float = 1.0
+    """Absolute colour difference, averaged over a pyramid of `pyramid` levels."""
+    pyramid: int = 4
+    """Levels of the L1 pyramid; 1 is plain L1."""
+    ssim: float = 0.1
+    """1 - SSIM."""
+    lpips: float = 0.0
+    """LPIPS (needs its weights: tools/fetch_lpips.py)."""
+    alpha: float = 0.3
+    """Absolute difference of alpha and mask (extension)."""
+    feature: float = 0.01
+    """L_feat, with the paper's gamma 0.1 at every level."""
+    prediction: float = 0.1
+    """L_pred, offsets in centimetres."""
+    smoothness: float = 0.05
+    """L_sm, accelerations in cm per frame squared."""
+    temporal_scale: float = 0.01
+    """Common factor of the three temporal losses, whose unit the paper does not give."""
+    still_speed: float = 0.3
+    """tau_reg in m/s: the motion magnitude at which the temporal weight has fallen to 1/e."""
+
+
+@dataclass(frozen=True)
+class ScheduleConfig:
+    """The three stages and the optimiser."""
+
+    steps: int = 3200
+    """Updates in all."""
+    minutes: float | None = None
+    """Wall-clock budget: the schedule is compressed to fit when the machine is too slow for `steps`."""
+    template_share: float = 0.08
+    """Share of the updates that fit the template alone, on near-rest frames."""
+    pose_share: float = 0.15
+    """Share that trains the network without feedback and memory (the paper's stage 1)."""
+    half_resolution_share: float = 0.75
+    """Share trained on images of half the size."""
+    streams: int = 2
+    """Rollouts that one worker advances together."""
+    views: int = 1
+    """Cameras rendered per rollout and frame."""
+    segment: int = 4
+    """Frames K of truncated back-propagation through time."""
+    horizon: int = 16
+    """Frames after which a rollout restarts when feedback begins; it grows to whole clips."""
+    learning_rate: float = 1e-3
+    """Peak rate of the network; cosine to 2 % of it."""
+    warmup: int = 50
+    """Updates of linear warm-up of the network's rate."""
+    template_rate: float = 0.1
+    """Factor on the template's rates once the network trains."""
+    clip: float = 1.0
+    """Largest norm of the network's gradient."""
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """A whole run."""
+
+    capture: str = "embedded"
+    """A capture folder, or `embedded`."""
+    body: str | None = None
+    """An SMPL-X model file; none: the capture's own, else the embedded body."""
+    preset: str = "demo"
+    """The preset that the other values started from."""
+    train_frames: str | None = None
+    """Frame range of each training sequence, e.g. 0-239; none: all."""
+    test_frames: str | None = None
+    """Frame range of each test sequence; none: all."""
+    seed: int = 0
+    """Seed of initialisation and sampling."""
+    workers: int = 2
+    """Processes that train together, one core each."""
+    atlas: AtlasConfig = field(default_factory=AtlasConfig)
+    model: ModelConfig = field(default_factory=ModelConfig)
+    loss: LossConfig = field(default_factory=LossConfig)
+    schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
+
+    def validate(self) -> None:
+        """Raise ConfigError where settings contradict each other."""
+        atlas, model = self.atlas, self.model
+        grid = model.upsample * 2 ** (len(model.channels) - 1)
+        for name, size in (("resolution", atlas.resolution), ("garment_rows", atlas.garment_rows)):
+            if size % grid:
+                raise ConfigError(
+                    f"atlas.{name} is {size}; with model.upsample {model.upsample} and {len(model.channels)} "
+                    f"levels it must be a multiple of {grid}"
+                )
+        if model.channels[-1] % model.heads:
+            raise ConfigError(
+                f"model.channels ends in {model.channels[-1]}, not a multiple of {model.heads} heads"
+            )
+        if model.window < 1 or model.memory < 0:
+            raise ConfigError(f"model.window is {model.window} (>= 1) and model.memory {model.memory} (>= 0)")
+        if not 0 < model.recall < 1:
+            raise ConfigError(f"model.recall is {model.recall}; it must lie strictly between 0 and 1")
+        if not 0 <= model.sh_degree <= 3:
+            raise ConfigError(f"model.sh_degree is {model.sh_degree}; harmonics go from degree 0 to 3")
+        if self.schedule.steps < 1 or self.workers < 1:
+            raise ConfigError(
+                f"schedule.steps ({self.schedule.steps}) and workers ({self.workers}) start at 1"
+            )
+
+
+PRESETS: dict[str, TrainConfig] = {
+    "demo": TrainConfig(),
+    "small": TrainConfig(
+        preset="small",
+        atlas=AtlasConfig(resolution=128, garment_rows=64),
+        schedule=ScheduleConfig(steps=20000, views=2),
+    ),
+    "paper": TrainConfig(
+        preset="paper",
+        atlas=AtlasConfig(resolution=512, garment="off", weight_smoothing=0.0),
+        model=ModelConfig(
+            wiring="shared",
+            window=10,
+            memory=10,
+            acceleration=False,
+            channels=(64, 128, 256, 512),
+            heads=8,
+            upsample=1,
+            identity_channels=0,
+            recall=0.1,
+        ),
+        loss=LossConfig(pyramid=1, ssim=0.2, lpips=0.5, alpha=0.0, temporal_scale=1.0),
+        schedule=ScheduleConfig(steps=300_000, learning_rate=6e-4, half_resolution_share=0.0, streams=1),
+    ),
+}
+
+
+def config_to_json(config: TrainConfig) -> str:
+    """Return the settings as readable JSON."""
+    return json.dumps(dataclasses.asdict(config), indent=2) + "\n"
+
+
+def config_from_json(path: Path) -> TrainConfig:
+    """Read a config.json; raise ConfigError where a key is unknown or missing."""
+    try:
+        values = json.loads(path.read_text())
+        sections = {
+            "atlas": AtlasConfig,
+            "model": ModelConfig,
+            "loss": LossConfig,
+            "schedule": ScheduleConfig,
+        }
+        for name, section in sections.items():
+            values[name] = section(**_tuples(values[name]))
+        return TrainConfig(**values)
+    except (OSError, json.JSONDecodeError, KeyError, TypeError) as error:
+        raise ConfigError(f"{path} is not a config.json that this version reads: {error}") from error
+
+
+def _tuples(section: dict[str, Any]) -> dict[str, Any]:
+    return {key: tuple(value) if isinstance(value, list) else value for key, value in section.items()}

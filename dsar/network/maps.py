@@ -1,0 +1,63 @@
+"""Position, velocity and acceleration maps: what the network sees of a motion (paper equation 4)."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+FPS = 30.0
+"""Reference rate: velocities are metres per 1/30 s whatever the motion's own rate."""
+SPEED_LIMIT = 0.4
+"""Metres per 1/30 s (12 m/s) at which velocities are cut, so that a teleport cannot explode the network."""
+
+
+@dataclass(frozen=True)
+class FrameMaps:
+    """The input maps of a batch of frames on the network's grid, metres and reference frames."""
+
+    maps: Float[Tensor, "b c h w"]
+    """Position, velocity, acceleration, in the frame's own heading frame, not yet standardised."""
+    speed: Float[Tensor, "b 1 h w"]
+    """Motion magnitude V, metres per 1/30 s."""
+
+
+def limit_norm(vectors: Float[Tensor, "*b 3"], limit: float) -> Float[Tensor, "*b 3"]:
+    """Shorten vectors that are longer than the limit, keeping their direction."""
+    norm = vectors.norm(dim=-1, keepdim=True)
+    return vectors * (limit / norm.clamp_min(limit))
+
+
+def maps_from_points(
+    points: Float[Tensor, "b 3 p 3"],
+    headings: Float[Tensor, "b 3 3"],
+    roots: Float[Tensor, "b 3"],
+    cells: Int64[Tensor, " p"],
+    size: tuple[int, int],
+    fps: float,
+    *,
+    velocity: bool,
+    acceleration: bool,
+) -> FrameMaps:
+    """Return input maps from the posed control points of each frame and of the two before it.
+
+    `points[:, 0]` is the newest frame, in world metres. Positions are relative to the root on the
+    ground plane and turned by the inverse heading; gravity's direction and the height stay.
+    Velocities are true world velocities in that frame, so a spin or a walk remains visible. They are
+    cut at SPEED_LIMIT. `cells` are flat grid indices of the points; other cells are zero.
+    """
+    ground = roots * roots.new_tensor([1.0, 0.0, 1.0])
+    rate = fps / FPS
+    position = torch.einsum("bpi,bij->bpj", points[:, 0] - ground[:, None], headings)
+    now = limit_norm((points[:, 0] - points[:, 1]) * rate, SPEED_LIMIT)
+    before = limit_norm((points[:, 1] - points[:, 2]) * rate, SPEED_LIMIT)
+    channels = [position]
+    if velocity:
+        channels.append(torch.einsum("bpi,bij->bpj", now, headings))
+    if acceleration:
+        channels.append(torch.einsum("bpi,bij->bpj", (now - before) * rate, headings))
+    values = torch.cat([*channels, now.norm(dim=-1, keepdim=True)], -1)
+    grid = values.new_zeros(len(values), values.shape[-1], size[0] * size[1])
+    grid[:, :, cells] = values.transpose(1, 2)
+    grid = grid.reshape(len(values), -1, *size)
+    return FrameMaps(grid[:, :-1], grid[:, -1:])

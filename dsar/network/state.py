@@ -1,0 +1,50 @@
+"""What the network remembers between frames."""
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class NetworkState:
+    """The two streams and the sliding window of a batch of independent rollouts.
+
+    Every tensor is meaningless while `fresh` is set: the first step fills the window with copies of
+    its own frame and the bank with copies of its own aggregate (paper: M_1 = h_1).
+    """
+
+    fresh: Bool[Tensor, " b"]
+    """Rollouts that have not seen a frame yet."""
+    window: tuple[Float[Tensor, "b n ..."], ...]
+    """Per level, oldest first: encodings (wiring `perframe`) or inputs (`shared`) of the last n frames."""
+    magnitude: Float[Tensor, "b n 1 hL wL"]
+    """Motion magnitude V of the last n frames at the coarsest level, oldest first."""
+    offset: Float[Tensor, "b 3 h w"]
+    """Geometric stream: the previous frame's offset map, canonical metres."""
+    memory: Float[Tensor, "b m c hL wL"]
+    """State stream: the bank of the last m hidden states h, oldest first."""
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> "NetworkState":
+        """Apply a function to every tensor."""
+        values = {
+            f.name: tuple(map(function, value)) if isinstance(value, tuple) else function(value)
+            for f in dataclasses.fields(self)
+            for value in (getattr(self, f.name),)
+        }
+        return dataclasses.replace(self, **values)
+
+    def detach(self) -> "NetworkState":
+        """Cut the state from the autograd graph (the border of truncated back-propagation)."""
+        return self.map(Tensor.detach)
+
+    def restart(self, rollouts: Bool[Tensor, " b"]) -> "NetworkState":
+        """Mark some rollouts as fresh; the others go on."""
+        return dataclasses.replace(
+            self,
+            fresh=self.fresh | rollouts,
+            offset=torch.where(rollouts[:, None, None, None], 0.0, self.offset),
+        )

@@ -1,0 +1,18 @@
+"""The constants that decide which Gaussian reaches which pixel: those of gsplat 1.5.3.
+
+Every backend uses exactly these, so that an image does not depend on the machine that made it.
+Compiled kernels bake them in: after a change, delete the kernel cache (`__pycache__/*.nb*`).
+"""
+
+EPS_2D = 0.3
+"""Added to both diagonal entries of the image-plane covariance, pixels²: no splat is thinner than a pixel."""
+ALPHA_MAX = 0.999
+"""A single Gaussian never hides what is behind it completely."""
+ALPHA_MIN = 1 / 255
+"""Fragments fainter than one 8-bit step are skipped."""
+TRANSMITTANCE_MIN = 1e-4
+"""The fragment that would bring a pixel's transmittance to this or below ends the pixel and is left out."""
+NEAR = 0.01
+"""Gaussians whose centre is nearer than this (camera z, metres) are not drawn."""
+FRUSTUM_MARGIN = 0.3
+"""The projection is linearised no further outside the image than this, as a share of its half-size in tangents."""

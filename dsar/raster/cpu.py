@@ -1,0 +1,149 @@
+"""The fast backend on the CPU: Numba kernels under one autograd function, float32.
+
+Gradients are written by hand and checked against dsar.raster.reference. Results are the same to the bit for any
+number of threads (`numba.set_num_threads`); with one thread they run in the caller's.
+"""
+
+import logging
+import time
+from functools import cache
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from dsar.raster.kernels_binning import bin_splats, gather_slots_part
+from dsar.raster.kernels_compositing import (
+    SUMS_SIZE,
+    TILE_HEIGHT,
+    TILE_WIDTH,
+    composite_backward_part,
+    composite_part,
+)
+from dsar.raster.kernels_projection import RECORD_SIZE, project_backward_part, project_part
+from dsar.raster.kernels_shading import shade_backward_part, shade_part
+from dsar.raster.parallel import run_parts
+from dsar.types import Camera, Gaussians, RenderOutput
+
+_log = logging.getLogger(__name__)
+_NO_IMAGE = np.empty((0, 0), np.float32)
+_NO_COLOR = np.empty((0, 0, 3), np.float32)
+_NO_DIRECTIONS = np.empty((0, 3), np.float32)
+_BLACK = np.zeros(3, np.float32)
+
+
+def rasterize_cpu(
+    gaussians: Gaussians,
+    camera: Camera,
+    background: Float[Tensor, "3"] | None = None,
+    directions: Float[Tensor, "n 3"] | None = None,
+) -> RenderOutput:
+    """Rasterise with the Numba kernels: `dsar.raster.rasterize` without its checks, for float32 on the CPU."""
+    _load_kernels()
+    return _apply(gaussians, camera, background, directions)
+
+
+def _apply(
+    gaussians: Gaussians, camera: Camera, background: Tensor | None, directions: Tensor | None
+) -> RenderOutput:
+    color, alpha, depth = _Rasterize.apply(
+        gaussians.means,
+        gaussians.rotations,
+        gaussians.scales,
+        gaussians.opacities,
+        gaussians.harmonics,
+        directions,
+        background,
+        camera,
+    )  # type: ignore[misc]  # autograd's apply is untyped
+    return RenderOutput(color, alpha, depth)
+
+
+class _Rasterize(torch.autograd.Function):
+    """Gaussians to (color, alpha, depth). The camera gets no gradient."""
+
+    @staticmethod
+    def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor, Tensor]:
+        *tensors, camera = inputs
+        ctx.set_materialize_grads(False)
+        means, rotations, scales, opacities, harmonics = (_as_array(tensor) for tensor in tensors[:5])
+        directions, background = _as_array(tensors[5], _NO_DIRECTIONS), _as_array(tensors[6], _BLACK)
+        n, width, height = len(means), camera.width, camera.height
+        view, center = _pack_camera(camera)
+        records, bounds = np.empty((n, RECORD_SIZE), np.float32), np.empty((n, 4), np.int32)
+        run_parts(project_part, means, rotations, scales, opacities, view, width, height, records, bounds)
+        run_parts(shade_part, means, harmonics, directions, center, records, bounds)
+        tiles_x, tiles_y = -(-width // TILE_WIDTH), -(-height // TILE_HEIGHT)
+        tile_starts, entries, slots, slot_starts = bin_splats(
+            records, bounds, tiles_x, tiles_y, TILE_WIDTH, TILE_HEIGHT
+        )
+        outputs = torch.empty(height, width, 3), torch.empty(height, width), torch.empty(height, width)
+        images = [output.numpy() for output in outputs]
+        run_parts(composite_part, records, tile_starts, entries, tiles_x, background, *images)
+        ctx.save_for_backward(*tensors, *outputs)
+        ctx.splats = records, bounds, view, center
+        ctx.bins = tile_starts, entries, slots, slot_starts, tiles_x
+        return outputs
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *v_outputs: Tensor | None) -> tuple[Tensor | None, ...]:
+        *tensors, color, alpha, depth = ctx.saved_tensors
+        means, rotations, scales, opacities, harmonics = (_as_array(tensor) for tensor in tensors[:5])
+        directions = _as_array(tensors[5], _NO_DIRECTIONS)
+        records, bounds, view, center = ctx.splats
+        tile_starts, entries, slots, slot_starts, tiles_x = ctx.bins
+        height, width = alpha.shape
+        images = color.numpy(), alpha.numpy(), depth.numpy()
+        v_color, v_alpha, v_depth = map(_as_array, v_outputs, (_NO_COLOR, _NO_IMAGE, _NO_IMAGE))
+        slot_sums = np.empty((len(slots), SUMS_SIZE), np.float32)
+        run_parts(composite_backward_part, records, tile_starts, entries, slots, tiles_x, *images,
+                           v_color, v_alpha, v_depth, slot_sums)  # fmt: skip
+        sums = np.empty((len(means), SUMS_SIZE), np.float32)
+        run_parts(gather_slots_part, slot_starts, slot_sums, sums)
+        gradients = [None if tensor is None else torch.zeros(tensor.shape) for tensor in tensors[:6]]
+        v_means, v_rotations, v_scales, v_opacities, v_harmonics = (_as_array(v) for v in gradients[:5])
+        v_directions = _as_array(gradients[5], _NO_DIRECTIONS)
+        run_parts(project_backward_part, means, rotations, scales, opacities, view, width, height, bounds, sums,
+                         v_means, v_rotations, v_scales, v_opacities)  # fmt: skip
+        run_parts(shade_backward_part, means, harmonics, directions, center, bounds, sums,
+                       v_harmonics, v_directions, v_means)  # fmt: skip
+        v_background = None
+        if ctx.needs_input_grad[6] and v_outputs[0] is not None:
+            v_background = torch.einsum("hw,hwc->c", 1 - alpha, v_outputs[0])
+        return *gradients, v_background, None
+
+
+def _as_array(tensor: Tensor | None, missing: np.ndarray = _BLACK) -> np.ndarray:
+    """Return a tensor's values as a C-contiguous array (shared where possible), or `missing` for None."""
+    return missing if tensor is None else tensor.detach().contiguous().numpy()
+
+
+def _pack_camera(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Return the kernels' camera (rotation, translation, fx, fy, cx, cy) and its centre in the world."""
+    transform, K = camera.T_camera_world.detach().numpy(), camera.K.detach().numpy()
+    rotation, translation = transform[:3, :3], transform[:3, 3]
+    view = np.empty(16, np.float32)
+    view[:9], view[9:12] = rotation.ravel(), translation
+    view[12:] = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    return view, (-rotation.T @ translation).astype(np.float32)
+
+
+@cache
+def _load_kernels() -> None:
+    """Load or compile the kernels by rendering one Gaussian, so that the wait is announced and not timed later."""
+    _log.info("Loading the rasteriser; its first use on a machine compiles it (about a minute)")
+    start = time.perf_counter()
+    one = Gaussians(
+        torch.tensor([[0.0, 0.0, 1.0]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]]), torch.full((1, 3), 0.1),
+        torch.full((1,), 0.5), torch.zeros(1, 1, 3),
+    )  # fmt: skip
+    camera = Camera(
+        torch.tensor([[8.0, 0.0, 4.0], [0.0, 8.0, 4.0], [0.0, 0.0, 1.0]]), torch.eye(4), 8, 8, "one"
+    )
+    with torch.enable_grad():
+        _apply(one.map(Tensor.requires_grad_), camera, None, None).color.sum().backward()
+    _log.info("Rasteriser ready after %.1f s", time.perf_counter() - start)

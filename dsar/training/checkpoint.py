@@ -1,0 +1,166 @@
+"""Run folders: what is written where, and how it is read back. No pickle is ever loaded.
+
+config.json              every setting of the run
+checkpoint/              replaced as a whole, never half written
+    avatar.safetensors       parameters, skeleton, atlas
+    optimizer.safetensors    moments of the optimiser
+    rollouts-<rank>.safetensors, rollouts-<rank>.json   carried state of each worker's rollouts
+    progress.json            step, progress, format version
+metrics.jsonl            one line per report
+"""
+
+import dataclasses
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from dsar.avatar.avatar import Avatar
+from dsar.body.atlas import Atlas
+from dsar.body.model import PARENTS, Body
+from dsar.config import TrainConfig, config_from_json
+from dsar.errors import CheckpointError, ConfigError
+
+FORMAT_VERSION = 1
+_BODY = ("vertices", "faces", "joints", "weights", "uv", "uv_faces")
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """The paths of a run folder."""
+
+    folder: Path
+    """The run's own folder."""
+
+    @property
+    def config(self) -> Path:
+        """All settings."""
+        return self.folder / "config.json"
+
+    @property
+    def metrics(self) -> Path:
+        """Training curve, one JSON object a line."""
+        return self.folder / "metrics.jsonl"
+
+    @property
+    def checkpoint(self) -> Path:
+        """The newest complete checkpoint."""
+        return self.folder / "checkpoint"
+
+    @property
+    def exists(self) -> bool:
+        """Whether the run has a checkpoint."""
+        return (self.checkpoint / "progress.json").exists()
+
+
+def newest_run(root: Path = Path("runs")) -> Run:
+    """Return the run with the newest checkpoint under `runs/`."""
+    found = sorted(root.glob("*/checkpoint/progress.json"), key=lambda path: path.stat().st_mtime)
+    if not found:
+        raise CheckpointError(
+            f"no trained run under {root}/; name one, or train one: dsar train --preset demo"
+        )
+    return Run(found[-1].parent.parent)
+
+
+def load_checkpoint(run: Run) -> tuple[Avatar, TrainConfig, dict[str, str]]:
+    """Return the trained avatar of a run, its settings, and its provenance for exported files."""
+    if not run.exists:
+        raise CheckpointError(
+            f"{run.folder} holds no checkpoint; expected {run.checkpoint}/avatar.safetensors"
+        )
+    try:
+        config = config_from_json(run.config)
+    except ConfigError as error:
+        raise CheckpointError(str(error)) from error
+    progress = read_progress(run)
+    path = run.checkpoint / "avatar.safetensors"
+    tensors = load_file(path)
+    body = Body(parents=PARENTS, **{name: tensors[f"body_{name}"] for name in _BODY})
+    height, width = (int(size) for size in tensors.pop("atlas_size"))
+    atlas = Atlas(height, width, tensors["texels"], tensors["texel_positions"], tensors["texel_weights"])
+    avatar = Avatar(body, atlas, config.model, float(tensors.pop("fps")))
+    avatar.load_state_dict(tensors)
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+    provenance = {"checkpoint": digest, "run": run.folder.name, "step": str(progress["step"])}
+    return avatar.eval(), config, provenance
+
+
+def save_avatar(avatar: Avatar, folder: Path) -> None:
+    """Write the avatar's parameters and everything needed to rebuild it."""
+    tensors = {name: value.detach().contiguous() for name, value in avatar.state_dict().items()}
+    tensors["atlas_size"] = torch.tensor(avatar.atlas_size)
+    tensors["fps"] = torch.tensor(avatar.fps, dtype=torch.float64)
+    save_file(tensors, folder / "avatar.safetensors")
+
+
+def save_optimizer(optimizer: torch.optim.Optimizer, folder: Path) -> None:
+    """Write the optimiser's moments; the parameters' order is the key."""
+    state = optimizer.state_dict()["state"]
+    tensors = {f"{index}.{name}": value for index, slot in state.items() for name, value in slot.items()}
+    save_file(tensors, folder / "optimizer.safetensors")
+
+
+def load_optimizer(optimizer: torch.optim.Optimizer, folder: Path) -> None:
+    """Restore what `save_optimizer` wrote."""
+    state: dict[int, dict[str, Tensor]] = {}
+    for key, value in load_file(folder / "optimizer.safetensors").items():
+        index, name = key.split(".", 1)
+        state.setdefault(int(index), {})[name] = value
+    optimizer.load_state_dict({**optimizer.state_dict(), "state": state})
+
+
+def save_rollouts(folder: Path, rank: int, tensors: Mapping[str, Tensor], places: Any) -> None:
+    """Write one worker's carried state."""
+    save_file({name: t.contiguous() for name, t in tensors.items()}, folder / f"rollouts-{rank}.safetensors")
+    (folder / f"rollouts-{rank}.json").write_text(json.dumps(places))
+
+
+def load_rollouts(folder: Path, rank: int) -> tuple[dict[str, Tensor], Any]:
+    """Restore what `save_rollouts` wrote.
+
+    Raises:
+        CheckpointError: the run was trained by another number of workers.
+    """
+    path = folder / f"rollouts-{rank}.safetensors"
+    if not path.exists():
+        raise CheckpointError(f"{folder} has no state of worker {rank}; resume with the run's own --workers")
+    return load_file(path), json.loads((folder / f"rollouts-{rank}.json").read_text())
+
+
+def save_progress(folder: Path, step: int, progress: float) -> None:
+    """Write where the run stands; written last, it marks a checkpoint as complete."""
+    content = {"format_version": FORMAT_VERSION, "step": step, "progress": progress}
+    (folder / "progress.json").write_text(json.dumps(content))
+
+
+def read_progress(run: Run) -> dict[str, Any]:
+    """Return step and progress of a run's checkpoint."""
+    content = json.loads((run.checkpoint / "progress.json").read_text())
+    if content["format_version"] != FORMAT_VERSION:
+        raise CheckpointError(
+            f"{run.checkpoint} has format {content['format_version']}, this version reads {FORMAT_VERSION}"
+        )
+    return content
+
+
+def replace_folder(new: Path, final: Path) -> None:
+    """Put a complete new folder in the place of an old one; a crash leaves one of them whole."""
+    old = final.with_name(final.name + ".old")
+    shutil.rmtree(old, ignore_errors=True)
+    if final.exists():
+        os.replace(final, old)
+    os.replace(new, final)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def load(folder: str | Path) -> Avatar:
+    """Return the trained avatar of a run folder."""
+    return load_checkpoint(Run(Path(folder)))[0]

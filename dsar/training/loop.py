@@ -1,0 +1,303 @@
+"""The training loop: read it from top to bottom."""
+
+import dataclasses
+import json
+import math
+import shutil
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import nn
+
+from dsar.avatar.avatar import Avatar
+from dsar.avatar.stillness import stillest_frames
+from dsar.body.files import load_body
+from dsar.config import TrainConfig, config_from_json, config_to_json
+from dsar.data.capture import open_capture
+from dsar.errors import CaptureError, CheckpointError, ConfigError, TrainingError
+from dsar.training import checkpoint as ckpt
+from dsar.training import workers
+from dsar.training.checkpoint import Run
+from dsar.training.lpips import load_lpips
+from dsar.training.segment import Progress, SegmentTrainer
+from dsar.training.stages import Position, position
+from dsar.types import Capture
+
+REPORT_EVERY = 20
+"""Updates between lines of metrics.jsonl."""
+SAVE_EVERY = 200
+"""Updates between checkpoints (not seconds: all workers must agree)."""
+STILL_FRAMES = 48
+"""Near-rest frames that the template is fitted to."""
+_TEMPLATE_RATES = {
+    "means": 1e-3,
+    "quaternions": 2e-3,
+    "log_scales": 5e-3,
+    "opacity_logits": 2e-2,
+    "harmonics": 1e-2,
+}
+
+
+@dataclass(frozen=True)
+class Report:
+    """One line of progress."""
+
+    step: int
+    """Updates done."""
+    steps: int
+    """Updates planned."""
+    progress: float
+    """Share of the schedule done, in [0, 1]."""
+    stage: str
+    """Stage of training."""
+    loss: float
+    """Smoothed loss."""
+    psnr: float
+    """Smoothed PSNR of training crops, dB."""
+    seconds: float
+    """Seconds since this process began."""
+
+
+Reporter = Callable[[Report], None]
+
+
+def train(config: TrainConfig, run: Run, *, resume: bool = False, report: Reporter | None = None) -> Run:
+    """Train an avatar, or go on with a run; return the run, its checkpoint written.
+
+    An interrupt (SIGINT) ends training after the current update with a checkpoint.
+
+    Raises:
+        DsarError: before any work, where settings, capture, body or run folder are not usable;
+            TrainingError when a value stops being finite.
+    """
+    config.validate()
+    open_capture(config.capture)
+    if run.exists and not resume:
+        raise CheckpointError(f"{run.folder} holds a run already; go on with --resume, or give another --out")
+    if resume and not run.exists:
+        raise CheckpointError(f"{run.folder} holds no checkpoint to resume; leave --resume out")
+    if resume:
+        check_same_settings(config, config_from_json(run.config), run)
+    run.folder.mkdir(parents=True, exist_ok=True)
+    run.config.write_text(config_to_json(config))
+    workers.run_workers(config.workers, _train, (config, run.folder, resume, report))
+    return run
+
+
+def check_same_settings(config: TrainConfig, saved: TrainConfig, run: Run) -> None:
+    """Raise ConfigError where a resumed run would change a setting other than its length."""
+    length = {"steps": config.schedule.steps, "minutes": config.schedule.minutes}
+    saved = dataclasses.replace(saved, schedule=dataclasses.replace(saved.schedule, **length))
+    asked, had = dataclasses.asdict(config), dataclasses.asdict(saved)
+    changed = sorted(key for key in asked if asked[key] != had[key])
+    if changed:
+        raise ConfigError(
+            f"--resume: {run.config} was made with other values of {', '.join(changed)}; repeat the command "
+            "that started the run, or start another with a new --out"
+        )
+
+
+def _train(config: TrainConfig, folder: Path, resume: bool, report: Reporter | None) -> None:
+    torch.manual_seed(config.seed)
+    run = Run(folder)
+    capture = open_capture(config.capture)
+    if resume:
+        avatar, _, _ = ckpt.load_checkpoint(run)
+    else:
+        body = load_body(Path(config.body) if config.body else capture.body_path, capture.betas)
+        avatar = Avatar.from_capture(capture, body, config.atlas, config.model)
+    lpips = load_lpips("alex") if config.loss.lpips else None
+    trainer = SegmentTrainer(config, capture, avatar.train(), training_clips(config, capture), lpips)
+    still = still_frames(trainer, avatar.fps)
+    optimizer = make_optimizer(avatar)
+    gradients = workers.Gradients(list(avatar.parameters()))
+    step, progress = 0, 0.0
+    if resume:
+        at = ckpt.read_progress(run)
+        step, progress = at["step"], at["progress"]
+        ckpt.load_optimizer(optimizer, run.checkpoint)
+        trainer.carry_on(*ckpt.load_rollouts(run.checkpoint, workers.rank()))
+    resumed_at, began = progress, time.monotonic()
+    smoothed: Progress | None = None
+    with _stop_signals() as received:
+        while progress < 1:
+            now = position(config.schedule, progress, step)
+            set_rates(optimizer, now)
+            rng = np.random.default_rng([config.seed, workers.rank(), step])
+            gradients.clear()
+            done = _segment(trainer, rng, now, still, step)
+            stop, used = gradients.average(bool(received), _used(config, began))
+            check_gradients(avatar, step)
+            nn.utils.clip_grad_norm_(avatar.network.parameters(), config.schedule.clip)
+            optimizer.step()
+            step += 1
+            progress = step / config.schedule.steps
+            if config.schedule.minutes is not None:
+                progress = max(progress, resumed_at + used)
+            smoothed = _smooth(smoothed, done)
+            if workers.rank() == 0 and (step % REPORT_EVERY == 0 or progress >= 1):
+                _report(run, config, step, progress, now, smoothed, time.monotonic() - began, report)
+            if stop or progress >= 1 or step % SAVE_EVERY == 0:
+                save(run, avatar, optimizer, trainer, step, progress)
+            if stop:
+                _leave(received)
+                return
+
+
+def _segment(
+    trainer: SegmentTrainer, rng: np.random.Generator, now: Position, still: list[tuple[str, int]], step: int
+) -> Progress:
+    try:
+        if now.stage == "template":
+            return trainer.template_segment(rng, still, now.reduction)
+        return trainer.segment(rng, now)
+    except TrainingError as error:
+        raise TrainingError(f"step {step} ({now.stage}): {error}") from error
+
+
+def training_clips(config: TrainConfig, capture: Capture) -> dict[str, range]:
+    """Return the frames of each training sequence that the settings allow.
+
+    Raises:
+        CaptureError: none are left.
+    """
+    clips = select_frames(capture, "train", config.train_frames)
+    if not clips:
+        raise CaptureError(
+            f"capture {capture.name}: no training frames in {config.train_frames or 'any sequence'}"
+        )
+    return clips
+
+
+def select_frames(capture: Capture, split: str, frames: str | None) -> dict[str, range]:
+    """Return, by sequence of a split, the frames inside a contiguous range such as 0-239 (None: all)."""
+    low, high = 0, None
+    if frames is not None:
+        first, _, last = frames.partition("-")
+        if not (first.isdigit() and (last or first).isdigit()):
+            raise ConfigError(f"frame range {frames!r} is not of the form 0-239")
+        low, high = int(first), int(last or first) + 1
+    clips = {}
+    for name in capture.splits[split]:
+        length = len(capture.motions[name])
+        clip = range(low, min(length, high if high is not None else length))
+        if len(clip):
+            clips[name] = clip
+    return clips
+
+
+def still_frames(trainer: SegmentTrainer, fps: float) -> list[tuple[str, int]]:
+    """Return the near-rest training frames that the template is fitted to."""
+    clips = trainer.streams.clips
+    tracks = {name: trainer.tracks[name][: clip.stop] for name, clip in clips.items()}
+    per_sequence = max(1, -(-STILL_FRAMES // len(clips)))
+    return stillest_frames(tracks, fps, STILL_FRAMES, per_sequence)
+
+
+def make_optimizer(avatar: Avatar) -> torch.optim.Adam:
+    """Return Adam over the network and each field of the template, at rates set anew each update.
+
+    Epsilon is far below the default: inner gradients of this network are smaller than 1e-8.
+    """
+    groups = [{"params": list(avatar.network.parameters()), "name": "network"}]
+    groups += [{"params": [p], "name": name} for name, p in avatar.template.named_parameters()]
+    return torch.optim.Adam(groups, lr=0.0, betas=(0.9, 0.99), eps=1e-15, fused=True)
+
+
+def set_rates(optimizer: torch.optim.Optimizer, now: Position) -> None:
+    """Set the learning rates of this update."""
+    for group in optimizer.param_groups:
+        name = group["name"]
+        group["lr"] = now.network_rate if name == "network" else _TEMPLATE_RATES[name] * now.template_factor
+
+
+def check_gradients(avatar: Avatar, step: int) -> None:
+    """Raise TrainingError naming the first parameter whose gradient is not finite."""
+    for name, parameter in avatar.named_parameters():
+        if parameter.grad is not None and not parameter.grad.isfinite().all():
+            raise TrainingError(f"step {step}: the gradient of {name} is not finite")
+
+
+def save(
+    run: Run,
+    avatar: Avatar,
+    optimizer: torch.optim.Optimizer,
+    trainer: SegmentTrainer,
+    step: int,
+    progress: float,
+) -> None:
+    """Write a complete checkpoint, every worker its own rollouts, and put it in place at once."""
+    folder = run.folder / "checkpoint.tmp"
+    if workers.rank() == 0:
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir()
+        ckpt.save_avatar(avatar, folder)
+        ckpt.save_optimizer(optimizer, folder)
+    workers.barrier()
+    ckpt.save_rollouts(folder, workers.rank(), *trainer.carried())
+    workers.barrier()
+    if workers.rank() == 0:
+        ckpt.save_progress(folder, step, progress)
+        ckpt.replace_folder(folder, run.checkpoint)
+    workers.barrier()
+
+
+def _used(config: TrainConfig, began: float) -> float:
+    minutes = config.schedule.minutes
+    return 0.0 if minutes is None else (time.monotonic() - began) / (60 * minutes)
+
+
+def _smooth(before: Progress | None, now: Progress) -> Progress:
+    if before is None:
+        return now
+    return Progress(0.95 * before.loss + 0.05 * now.loss, 0.95 * before.mse + 0.05 * now.mse)
+
+
+def _report(
+    run: Run,
+    config: TrainConfig,
+    step: int,
+    progress: float,
+    now: Position,
+    smoothed: Progress,
+    seconds: float,
+    reporter: Reporter | None,
+) -> None:
+    psnr = -10 * math.log10(max(smoothed.mse, 1e-10))
+    line = Report(step, config.schedule.steps, progress, now.stage, smoothed.loss, psnr, seconds)
+    with run.metrics.open("a") as file:
+        file.write(json.dumps(dataclasses.asdict(line)) + "\n")
+    if reporter is not None:
+        reporter(line)
+
+
+@contextmanager
+def _stop_signals() -> Iterator[list[int]]:
+    """Collect SIGINT and SIGTERM in the first worker; the others follow it and ignore the keyboard."""
+    received: list[int] = []
+    first = workers.rank() == 0
+
+    def note(number: int, _frame: object) -> None:
+        if first:
+            received.append(number)
+
+    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield received
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _leave(received: list[int]) -> None:
+    """End training in the way that the signal asks for."""
+    if signal.SIGTERM in received:
+        raise SystemExit(128 + signal.SIGTERM)
+    if received:
+        raise KeyboardInterrupt

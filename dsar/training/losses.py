@@ -1,0 +1,133 @@
+"""Image losses (paper equation 23) and the three adaptive temporal regularisers (equations 17-22)."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+
+from dsar.config import LossConfig
+from dsar.network import NetworkOutput
+from dsar.network.maps import FPS
+from dsar.training.targets import Target
+from dsar.types import RenderOutput
+
+_GAMMA = 0.1
+_CENTIMETRES = 100.0
+_SSIM_WINDOW, _SSIM_SIGMA = 11, 1.5
+
+
+def pyramid_l1(
+    image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"], levels: int
+) -> Float[Tensor, ""]:
+    """Return the mean absolute difference, averaged over levels that halve the resolution.
+
+    Coarse levels pull a garment towards a place it does not overlap yet.
+    """
+    difference = (image - target).permute(2, 0, 1)[None]
+    total = difference.abs().mean()
+    for _ in range(levels - 1):
+        difference = torch.nn.functional.avg_pool2d(difference, 2, ceil_mode=True, count_include_pad=False)
+        total = total + difference.abs().mean()
+    return total / levels
+
+
+def ssim(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
+    """Return the mean structural similarity of two images in [0, 1] (Wang et al. 2004; 11x11 Gaussian)."""
+    x, y = image.permute(2, 0, 1), target.permute(2, 0, 1)
+    moments = torch.cat([x, y, x * x, y * y, x * y])[:, None]
+    offsets = torch.arange(_SSIM_WINDOW) - _SSIM_WINDOW // 2
+    window = torch.exp(-(offsets**2) / (2 * _SSIM_SIGMA**2)).to(image)
+    window = window / window.sum()
+    pad = _SSIM_WINDOW // 2
+    moments = torch.nn.functional.conv2d(moments, window[None, None, :, None], padding=(pad, 0))
+    moments = torch.nn.functional.conv2d(moments, window[None, None, None, :], padding=(0, pad))
+    mx, my, mxx, myy, mxy = moments.squeeze(1).chunk(5)
+    vx, vy, vxy = mxx - mx * mx, myy - my * my, mxy - mx * my
+    c1, c2 = 0.01**2, 0.03**2
+    score = (2 * mx * my + c1) * (2 * vxy + c2) / ((mx * mx + my * my + c1) * (vx + vy + c2))
+    return score.mean()
+
+
+def image_loss(
+    output: RenderOutput,
+    target: Target,
+    background: Float[Tensor, "3"],
+    config: LossConfig,
+    lpips: torch.nn.Module | None,
+) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
+    """Return L_render of one view over a background, and its mean squared error for reporting."""
+    truth = target.color + (1 - target.alpha[..., None]) * background
+    loss = config.l1 * pyramid_l1(output.color, truth, config.pyramid)
+    if config.ssim:
+        loss = loss + config.ssim * (1 - ssim(output.color, truth))
+    if config.alpha:
+        loss = loss + config.alpha * (output.alpha - target.alpha).abs().mean()
+    if lpips is not None:
+        pair = [image.permute(2, 0, 1)[None].clamp(0, 1) for image in (output.color, truth)]
+        loss = loss + config.lpips * lpips(*pair).mean()
+    return loss, (output.color.detach() - truth).square().mean()
+
+
+@dataclass(frozen=True)
+class TemporalRecord:
+    """What the temporal losses remember of one frame of a batch of rollouts."""
+
+    output: NetworkOutput
+    """The network's residual maps and features."""
+    posed: Float[Tensor, "b p 3"]
+    """Deformed control points in the world, metres."""
+    speed: Float[Tensor, "b 1 h w"]
+    """Motion magnitude V, metres per 1/30 s."""
+
+    def detach(self) -> "TemporalRecord":
+        """Cut the record from the autograd graph."""
+        output = NetworkOutput(
+            self.output.offset.detach(),
+            self.output.appearance.detach(),
+            tuple(feature.detach() for feature in self.output.features),
+        )
+        return TemporalRecord(output, self.posed.detach(), self.speed)
+
+
+def temporal_loss(
+    records: list[TemporalRecord],
+    ages: list[int],
+    occupied: Float[Tensor, "1 1 h w"],
+    cells: Int64[Tensor, " p"],
+    config: LossConfig,
+) -> Float[Tensor, ""]:
+    """Return the weighted temporal losses of the newest record against the one or two before it.
+
+    `ages` counts the frames that each rollout has seen before the newest: rollouts without enough
+    past are left out. The adaptive weight is exp(-V / tau_reg) with V the largest of the recorded
+    frames, since V alone falls to zero at a stop, exactly when the cloth swings most.
+    """
+    newest = records[-1]
+    total = newest.posed.new_zeros(())
+    if len(records) < 2:
+        return total
+    speed = torch.stack([record.speed for record in records]).amax(0)
+    weight = torch.exp(-speed * FPS / config.still_speed) * occupied
+    one, two = (newest.posed.new_tensor([float(age >= past) for age in ages]) for past in (1, 2))
+    previous = records[-2]
+    total = total + config.prediction * _prediction(newest.output, previous.output, weight, one)
+    features = zip(newest.output.features, previous.output.features, strict=True)
+    for current, past in features:
+        total = total + config.feature * _GAMMA * ((current - past).square().mean((1, 2, 3)) * one).mean()
+    if len(records) > 2:
+        acceleration = (newest.posed - 2 * previous.posed + records[-3].posed) * _CENTIMETRES
+        at_cells = weight.flatten(1)[:, cells]
+        jolt = (at_cells * acceleration.square().sum(-1)).mean(1)
+        total = total + config.smoothness * (jolt * two).mean()
+    return config.temporal_scale * total
+
+
+def _prediction(
+    current: NetworkOutput, past: NetworkOutput, weight: Float[Tensor, "b 1 h w"], valid: Float[Tensor, " b"]
+) -> Float[Tensor, ""]:
+    """Return L_pred (equation 19): change of offset (cm), quaternion and log-scale between frames."""
+    moved = (current.offset - past.offset) * _CENTIMETRES
+    turned = current.appearance[:, :7] - past.appearance[:, :7]
+    change = moved.square().sum(1, keepdim=True) + turned.square().sum(1, keepdim=True)
+    return ((weight * change).mean((1, 2, 3)) * valid).mean()

@@ -1,0 +1,157 @@
+"""One update's worth of work: a segment of K frames of several rollouts, rendered and compared."""
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from dsar.avatar.avatar import Avatar, blend, contexts
+from dsar.config import TrainConfig
+from dsar.errors import TrainingError
+from dsar.network import NetworkOutput, NetworkState
+from dsar.network.maps import FrameMaps
+from dsar.raster import rasterize
+from dsar.training.losses import TemporalRecord, image_loss, temporal_loss
+from dsar.training.stages import Position
+from dsar.training.streams import Stream, Streams
+from dsar.training.targets import load_target
+from dsar.types import Capture, Gaussians
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a segment reports."""
+
+    loss: float
+    """Total loss per rendered view."""
+    mse: float
+    """Mean squared colour error per view, over the crop and a random background."""
+
+
+class SegmentTrainer:
+    """Holds a worker's rollouts and turns each segment of them into gradients."""
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        capture: Capture,
+        avatar: Avatar,
+        clips: dict[str, range],
+        lpips: nn.Module | None,
+    ) -> None:
+        self.config, self.capture, self.avatar, self.lpips = config, capture, avatar, lpips
+        self.tracks = {name: avatar.track(capture.motions[name]) for name in clips}
+        self.streams = Streams(clips, config.schedule.streams)
+        self.state: NetworkState = avatar.start(config.schedule.streams)
+        self.records: deque[TemporalRecord] = deque(maxlen=max(3, config.model.window))
+
+    def template_segment(
+        self, rng: np.random.Generator, still: list[tuple[str, int]], reduction: int
+    ) -> Progress:
+        """Back-propagate views of the template alone on still frames."""
+        count = self.config.schedule.streams * self.config.schedule.segment
+        loss, mse = torch.zeros(()), torch.zeros(())
+        for index in rng.choice(len(still), count):
+            name, frame = still[index]
+            context = contexts(self.tracks[name], torch.tensor([frame]))
+            gaussians = self.avatar.gaussians(context, None)[0]
+            view = self._views(rng, gaussians, name, frame, reduction)
+            loss, mse = loss + view[0], mse + view[1]
+        return self._finish(loss, mse, count * self.config.schedule.views)
+
+    def segment(self, rng: np.random.Generator, position: Position) -> Progress:
+        """Advance every rollout by K frames and back-propagate through them."""
+        schedule, with_streams = self.config.schedule, position.stage == "autoregressive"
+        loss, mse, count = torch.zeros(()), torch.zeros(()), 0
+        for _ in range(schedule.segment):
+            places, fresh = self.streams.next_frames(rng, position.horizon)
+            self.state = self.state.restart(torch.tensor(fresh))
+            context = torch.cat([contexts(self.tracks[p.sequence], torch.tensor([p.frame])) for p in places])
+            output, self.state, observed = self.avatar.advance(context, self.state, streams=with_streams)
+            gaussians = self.avatar.gaussians(context, output)
+            for place, each in zip(places, gaussians, strict=True):
+                view = self._views(rng, each, place.sequence, place.frame, position.reduction)
+                loss, mse, count = loss + view[0], mse + view[1], count + schedule.views
+            if with_streams:
+                loss = loss + self._temporal(context, output, observed, places) * len(places) * schedule.views
+            self.streams.advance()
+        progress = self._finish(loss, mse, count)
+        self.state = self.state.detach()
+        for _ in range(len(self.records)):
+            self.records.append(self.records.popleft().detach())
+        return progress
+
+    def carried(self) -> tuple[dict[str, Tensor], list[dict[str, str | int]]]:
+        """Return what must survive a restart: the rollouts' state as tensors, and their places."""
+        tensors = {"fresh": self.state.fresh, "magnitude": self.state.magnitude}
+        tensors |= {"offset": self.state.offset, "memory": self.state.memory}
+        tensors |= {f"window.{i}": level for i, level in enumerate(self.state.window)}
+        for i, record in enumerate(self.records):
+            tensors |= {f"record.{i}.offset": record.output.offset, f"record.{i}.posed": record.posed}
+            tensors |= {f"record.{i}.appearance": record.output.appearance, f"record.{i}.speed": record.speed}
+            tensors |= {f"record.{i}.feature.{k}": f for k, f in enumerate(record.output.features)}
+        places = [vars(stream) for stream in self.streams.streams if stream is not None]
+        return tensors, places
+
+    def carry_on(self, tensors: dict[str, Tensor], places: list[dict[str, str | int]]) -> None:
+        """Restore what `carried` returned."""
+        levels = len(self.state.window)
+        self.state = NetworkState(
+            fresh=tensors["fresh"],
+            window=tuple(tensors[f"window.{i}"] for i in range(levels)),
+            magnitude=tensors["magnitude"],
+            offset=tensors["offset"],
+            memory=tensors["memory"],
+        )
+        self.records.clear()
+        while f"record.{len(self.records)}.offset" in tensors:
+            prefix = f"record.{len(self.records)}"
+            features = tuple(tensors[f"{prefix}.feature.{k}"] for k in range(len(self.config.model.channels)))
+            output = NetworkOutput(tensors[f"{prefix}.offset"], tensors[f"{prefix}.appearance"], features)
+            self.records.append(
+                TemporalRecord(output, tensors[f"{prefix}.posed"], tensors[f"{prefix}.speed"])
+            )
+        if places:
+            self.streams.streams[:] = [Stream(**place) for place in places]  # pyright: ignore[reportArgumentType]
+
+    def _views(
+        self, rng: np.random.Generator, gaussians: Gaussians, sequence: str, frame: int, reduction: int
+    ) -> tuple[Tensor, Tensor]:
+        """Return summed loss and squared error of random cameras on a random background."""
+        loss, mse = torch.zeros(()), torch.zeros(())
+        for index in rng.choice(len(self.capture.cameras), self.config.schedule.views, replace=False):
+            target = load_target(self.capture, sequence, frame, int(index), reduction)
+            background = torch.from_numpy(rng.random(3, np.float32))
+            output = rasterize(gaussians, target.camera, background=background)
+            one, error = image_loss(output, target, background, self.config.loss, self.lpips)
+            loss, mse = loss + one, mse + error
+        return loss, mse
+
+    def _temporal(
+        self, context: Tensor, output: NetworkOutput, observed: FrameMaps, places: list[Stream]
+    ) -> Tensor:
+        """Append this frame's record and return the temporal losses against the frames before it."""
+        avatar = self.avatar
+        blended = blend(avatar.control_weights, context[:, :1])[:, 0]
+        deformed = avatar.control_points + output.offset.flatten(2)[:, :, avatar.cells].transpose(1, 2)
+        posed = (blended[..., :3] * deformed[..., None, :]).sum(-1) + blended[..., 3]
+        self.records.append(TemporalRecord(output, posed, observed.speed))
+        ages = [place.age for place in places]
+        return temporal_loss(
+            list(self.records), ages, avatar.network.occupied, avatar.cells, self.config.loss
+        )
+
+    def _finish(self, loss: Tensor, mse: Tensor, count: int) -> Progress:
+        loss = loss / count
+        if not loss.isfinite():
+            raise TrainingError(
+                f"the loss is {float(loss)}; first tensor that is not finite: {self._culprit()}"
+            )
+        loss.backward()
+        return Progress(float(loss.detach()), float(mse) / count)
+
+    def _culprit(self) -> str:
+        named = [*self.avatar.named_parameters(), *((f"state.{k}", v) for k, v in self.carried()[0].items())]
+        return next((name for name, value in named if not value.isfinite().all()), "the rendered image")

@@ -1,0 +1,175 @@
+"""The records that cross room borders, each with one frame, one unit and one convention.
+
+World: metres, Y up, right-handed. Cameras: OpenCV (x right, y down, z forward).
+Pixel (0, 0) has its centre at (0.5, 0.5). Quaternions: unit, wxyz. Colours: display-referred sRGB.
+`T_dst_src` maps points from frame `src` to frame `dst`. See docs/conventions.md.
+"""
+
+import dataclasses
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """A set of 3D Gaussians with physical values, never log-scales or logits."""
+
+    means: Float[Tensor, "n 3"]
+    """Centres in world metres."""
+    rotations: Float[Tensor, "n 4"]
+    """Unit quaternions wxyz, Gaussian axes to world."""
+    scales: Float[Tensor, "n 3"]
+    """Standard deviations along the Gaussian's axes, metres, > 0."""
+    opacities: Float[Tensor, " n"]
+    """Peak opacity in [0, 1]."""
+    harmonics: Float[Tensor, "n k 3"]
+    """Spherical-harmonic coefficients, DC first; colour = basis · harmonics + 0.5, clamped at 0."""
+
+    def __post_init__(self) -> None:
+        """Check that all fields describe the same number of Gaussians."""
+        counts = {f.name: len(getattr(self, f.name)) for f in dataclasses.fields(self)}
+        if len(set(counts.values())) != 1:
+            raise ValueError(f"Gaussians fields disagree in length: {counts}")
+
+    def __len__(self) -> int:
+        """Return the number of Gaussians."""
+        return len(self.means)
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> "Gaussians":
+        """Apply a function (a cast, a device move, a selection) to every field."""
+        values = {f.name: function(getattr(self, f.name)) for f in dataclasses.fields(self)}
+        return dataclasses.replace(self, **values)
+
+    def detach(self) -> "Gaussians":
+        """Return the same values cut from the autograd graph."""
+        return self.map(Tensor.detach)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A calibrated pinhole camera in the OpenCV convention."""
+
+    K: Float[Tensor, "3 3"]
+    """Intrinsics in pixels; the top-left corner of the image is (0, 0), not its first pixel centre."""
+    T_camera_world: Float[Tensor, "4 4"]
+    """Rigid transform of world points to the camera (x right, y down, z forward)."""
+    width: int
+    """Image width in pixels."""
+    height: int
+    """Image height in pixels."""
+    name: str
+    """A valid USD identifier; also the folder, view and label name in every export."""
+
+    @property
+    def center(self) -> Float[Tensor, "3"]:
+        """The camera's position in world metres."""
+        rotation, translation = self.T_camera_world[:3, :3], self.T_camera_world[:3, 3]
+        return -rotation.T @ translation
+
+    def resized(self, width: int, height: int) -> "Camera":
+        """Return the same view sampled at another resolution."""
+        scale = torch.tensor([[width / self.width], [height / self.height], [1.0]])
+        return dataclasses.replace(self, K=self.K * scale.to(self.K), width=width, height=height)
+
+    def cropped(self, x: int, y: int, width: int, height: int) -> "Camera":
+        """Return the view through the pixel rectangle whose top-left corner is (x, y)."""
+        shift = torch.tensor([[0.0, 0.0, x], [0.0, 0.0, y], [0.0, 0.0, 0.0]])
+        return dataclasses.replace(self, K=self.K - shift.to(self.K), width=width, height=height)
+
+
+@dataclass(frozen=True)
+class Pose:
+    """One instant of a motion: joint rotations and root translation of an SMPL-X skeleton."""
+
+    rotations: Float[Tensor, "j 3"]
+    """Axis-angle of each joint relative to its parent, radians; joint 0 (pelvis) relative to the world."""
+    translation: Float[Tensor, "3"]
+    """SMPL-X `transl`: added after posing, world metres."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A sequence of poses at a fixed rate, in the Y-up world."""
+
+    rotations: Float[Tensor, "f j 3"]
+    """Axis-angle per frame and joint, radians (see `Pose`)."""
+    translations: Float[Tensor, "f 3"]
+    """SMPL-X `transl` per frame, world metres."""
+    fps: float
+    """Frames per second."""
+    name: str = "motion"
+    """Label of the sequence."""
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+        return len(self.rotations)
+
+    def __getitem__(self, index: int) -> Pose:
+        """Return the pose of one frame."""
+        return Pose(self.rotations[index], self.translations[index])
+
+    def slice(self, start: int, stop: int) -> "Motion":
+        """Return frames start..stop-1 as a motion of their own."""
+        return dataclasses.replace(
+            self, rotations=self.rotations[start:stop], translations=self.translations[start:stop]
+        )
+
+
+@dataclass(frozen=True)
+class RenderOutput:
+    """What the rasteriser makes of one view."""
+
+    color: Float[Tensor, "h w 3"]
+    """Display-referred sRGB, premultiplied by alpha; over the background if one was given."""
+    alpha: Float[Tensor, "h w"]
+    """Coverage in [0, 1]."""
+    depth: Float[Tensor, "h w"]
+    """Expected camera-space z in metres, sum(w z) / sum(w); 0 where nothing was hit."""
+
+
+@dataclass(frozen=True)
+class GaussianSequence:
+    """A rollout: a fixed set of Gaussians over time, made frame by frame as it is iterated."""
+
+    frame_numbers: Sequence[int]
+    """Frame numbers in the order they are produced (a film starts at 1001)."""
+    fps: float
+    """Frames per second of the frame numbers."""
+    num_gaussians: int
+    """The same in every frame; index i is the same Gaussian throughout."""
+    produce: Callable[[], Iterator[Gaussians]] = field(repr=False)
+    """Starts a fresh pass and yields one Gaussians per frame number."""
+    provenance: Mapping[str, str] = field(default_factory=dict)
+    """Where the frames come from: checkpoint hash, motion, version. Written into every file."""
+
+    def __len__(self) -> int:
+        """Return the number of frames."""
+        return len(self.frame_numbers)
+
+    def __iter__(self) -> Iterator[tuple[int, Gaussians]]:
+        """Yield (frame number, Gaussians); every call is a new pass from the first frame."""
+        return zip(self.frame_numbers, self.produce(), strict=True)
+
+
+@runtime_checkable
+class Capture(Protocol):
+    """Multi-view video of one dressed person, as every reader presents it."""
+
+    name: str
+    """Label of the capture."""
+    cameras: Sequence[Camera]
+    """Calibrated cameras, the same for every frame."""
+    motions: Mapping[str, Motion]
+    """Body motion of each sequence, by sequence name."""
+    splits: Mapping[str, Sequence[str]]
+    """Sequence names of `train` and `test` (and of labelled subsets such as `nd`, `fd`)."""
+
+    def image(self, sequence: str, frame: int, camera: int) -> UInt8[np.ndarray, "h w 4"]:
+        """Return one image: straight (not premultiplied) sRGB and the mask as alpha."""
+        ...

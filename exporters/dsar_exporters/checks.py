@@ -1,0 +1,89 @@
+"""What every writer asks of its input before it opens a file."""
+
+import re
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+
+import torch
+
+from dsar.errors import ExportError
+from dsar.types import Camera, Gaussians, GaussianSequence
+
+_IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+_HARMONICS_COUNTS = (1, 4, 9, 16)
+
+
+def check_name(what: str, name: str) -> None:
+    """Check that a name is a valid identifier: it becomes a USD prim, an EXR view and a part of file names.
+
+    Raises:
+        ExportError: It is not.
+    """
+    if not _IDENTIFIER.fullmatch(name):
+        raise ExportError(
+            f"{what}: expected letters, digits and _ (no leading digit), found {name!r}: rename it"
+        )
+
+
+def check_cameras(cameras: Sequence[Camera]) -> None:
+    """Check that camera names are valid and distinct.
+
+    Raises:
+        ExportError: A name is no identifier or is used twice.
+    """
+    names = [camera.name for camera in cameras]
+    for name in names:
+        check_name("camera name", name)
+    if doubled := {name for name in names if names.count(name) > 1}:
+        raise ExportError(f"camera names: expected distinct names, found {sorted(doubled)} twice: rename one")
+
+
+def check_sequence(sequence: GaussianSequence) -> None:
+    """Check what a sequence says about itself, without producing a frame.
+
+    Raises:
+        ExportError: No frames, frame numbers that do not ascend, or a frame rate that is not positive.
+    """
+    frames = sequence.frame_numbers
+    if not frames:
+        raise ExportError("sequence: expected at least one frame, found none: widen the frame range")
+    if any(later <= earlier for earlier, later in pairwise(frames)):
+        raise ExportError(
+            f"sequence: expected ascending frame numbers, found {list(frames)[:8]}...: sort them"
+        )
+    if not sequence.fps > 0:
+        raise ExportError(f"sequence: expected frames per second > 0, found {sequence.fps}")
+
+
+def checked_frames(sequence: GaussianSequence) -> Iterator[tuple[int, Gaussians]]:
+    """Yield (frame number, Gaussians as float32 on the CPU), one frame in memory at a time.
+
+    Raises:
+        ExportError: A frame has another number of Gaussians than the sequence says, another number of
+            harmonics than the first frame, or a value that is not finite.
+    """
+    harmonics_count = None
+    for frame, gaussians in sequence:
+        if len(gaussians) != sequence.num_gaussians:
+            raise ExportError(
+                f"frame {frame}: expected {sequence.num_gaussians} Gaussians, found {len(gaussians)}: "
+                "an animated asset needs the same Gaussians in every frame"
+            )
+        found = gaussians.harmonics.shape[1]
+        expected = _HARMONICS_COUNTS if harmonics_count is None else (harmonics_count,)
+        if found not in expected:
+            raise ExportError(f"frame {frame}: expected {expected} harmonics per Gaussian, found {found}")
+        harmonics_count = found
+        frame_values = gaussians.map(lambda values: values.detach().cpu().to(torch.float32).contiguous())
+        _check_finite(frame, frame_values)
+        yield frame, frame_values
+
+
+def _check_finite(frame: int, gaussians: Gaussians) -> None:
+    for name, values in vars(gaussians).items():
+        broken = (~torch.isfinite(values)).sum().item()
+        if broken:
+            raise ExportError(
+                f"frame {frame}: expected finite {name}, found {broken} values that are not: the rollout "
+                "diverged; export the frames before it, or train longer"
+            )

@@ -1,0 +1,106 @@
+"""A tiny capture on disk, in the documented format: a speckled body that sways, seen by four cameras."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+SIZE = (48, 64)
+FRAMES = {"sway": 12, "turn": 14, "bend": 10}
+
+
+def motions():
+    from dsar.types import Motion
+
+    made = {}
+    for index, (name, frames) in enumerate(FRAMES.items()):
+        t = torch.arange(frames) / 30
+        rotations, translations = torch.zeros(frames, 55, 3), torch.zeros(frames, 3)
+        rotations[:, 16, 2], rotations[:, 17, 2] = -1.1, 1.1
+        rotations[:, 0, 1] = (1 + index) * t
+        rotations[:, 3, 0] = 0.4 * torch.sin(8 * t) * index
+        translations[:, 0] = 0.1 * torch.sin(6 * t)
+        made[name] = Motion(rotations, translations, 30.0, name)
+    return made
+
+
+def cameras():
+    from dsar.geometry.cameras import look_at
+    from dsar.types import Camera
+
+    K = torch.tensor([[70.0, 0.0, SIZE[0] / 2], [0.0, 70.0, SIZE[1] / 2], [0.0, 0.0, 1.0]])
+    places = [(math.sin(a) * 2.4, 0.3, math.cos(a) * 2.4) for a in (0.0, 1.6, 3.1, 4.7)]
+    target = np.zeros(3)
+    return [Camera(K, look_at(np.array(place), target), *SIZE, f"cam{i}") for i, place in enumerate(places)]
+
+
+def speckled(body, motion):
+    """Yield the Gaussians of a body with a fixed random colour at each texel."""
+    from dsar.avatar.avatar import Avatar
+    from dsar.avatar.rollout import roll_out
+    from dsar.body.atlas import Atlas, body_chart
+    from dsar.config import ModelConfig
+
+    generator = torch.Generator().manual_seed(5)
+    avatar = Avatar(body, Atlas.stack([body_chart(body, 32)]), ModelConfig(channels=(4, 8), heads=2), 30.0)
+    with torch.no_grad():
+        avatar.template.harmonics.copy_(torch.randn(avatar.num_gaussians, 1, 3, generator=generator))
+        avatar.template.opacity_logits.fill_(4.0)
+    for _, gaussians in roll_out(avatar, motion):
+        yield gaussians
+
+
+@pytest.fixture(scope="session")
+def tiny_capture(tmp_path_factory) -> Path:
+    """Return the folder of the tiny capture."""
+    from dsar.body.files import load_body
+    from dsar.data.motion import write_motion
+    from dsar.raster import rasterize
+
+    folder = tmp_path_factory.mktemp("tiny")
+    (folder / "motion").mkdir()
+    body, rig = load_body(), cameras()
+    sequences = {}
+    for name, motion in motions().items():
+        write_motion(folder / "motion" / f"{name}.npz", motion, body)
+        for frame, gaussians in enumerate(speckled(body, motion)):
+            for camera in rig:
+                output = rasterize(gaussians, camera)
+                straight = output.color / output.alpha[..., None].clamp_min(1e-3)
+                pixels = torch.cat([straight, output.alpha[..., None]], -1).clamp(0, 1) * 255
+                path = folder / "images" / name / camera.name / f"{frame:04d}.png"
+                path.parent.mkdir(parents=True, exist_ok=True)
+                Image.fromarray(pixels.round().byte().numpy(), "RGBA").save(path)
+        sequences[name] = {
+            "motion": f"motion/{name}.npz",
+            "images": f"images/{name}",
+            "frames": len(motion),
+            "split": "test" if name == "bend" else "train",
+            "labels": ["fd"] if name == "bend" else [],
+        }
+    description = {
+        "format": "dsar-capture",
+        "version": 1,
+        "name": "tiny",
+        "fps": 30.0,
+        "cameras": [
+            {
+                "name": camera.name,
+                "K": camera.K.tolist(),
+                "T_camera_world": camera.T_camera_world.tolist(),
+                "width": camera.width,
+                "height": camera.height,
+            }
+            for camera in rig
+        ],
+        "body": None,
+        "betas": [0.0] * 10,
+        "sequences": sequences,
+        "one_to_many": [],
+    }
+    (folder / "capture.json").write_text(json.dumps(description))
+    return folder

@@ -1,0 +1,104 @@
+"""Rollouts of a network with random weights: causality, equivariance, and long-run bounds."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from dsar.avatar.avatar import Avatar
+from dsar.avatar.rollout import roll_out
+from dsar.body.atlas import Atlas, body_chart
+from dsar.body.files import load_body
+from dsar.config import ModelConfig
+from dsar.data.motion import turn_motion
+from dsar.errors import MotionError
+from dsar.geometry.rotations import matrix_from_axis_angle, matrix_from_quaternion
+from dsar.types import Motion
+
+
+@pytest.fixture(scope="module", params=["perframe", "shared"])
+def avatar(request):
+    torch.manual_seed(0)
+    body = load_body()
+    config = ModelConfig(wiring=request.param, channels=(8, 16), heads=2, window=4, memory=3, sh_degree=1)
+    made = Avatar(body, Atlas.stack([body_chart(body, 32)]), config, 30.0)
+    torch.nn.init.normal_(made.network.decoder.head.weight, std=0.2)
+    torch.nn.init.normal_(made.template.harmonics, std=0.2)
+    made.measure_maps([made.track(dance(60))])
+    return made.eval()
+
+
+def dance(frames: int) -> Motion:
+    generator = torch.Generator().manual_seed(3)
+    t = torch.arange(frames)[:, None, None] / 30
+    phase, speed = 6 * torch.rand(55, 3, generator=generator), 1 + 3 * torch.rand(55, 3, generator=generator)
+    rotations = 0.25 * torch.sin(speed * t + phase)
+    rotations[:, 0] = torch.stack([0.1 * t[:, 0, 0].sin(), 2 * t[:, 0, 0], 0 * t[:, 0, 0]], -1)
+    translations = 0.3 * torch.sin(t[:, 0] * torch.tensor([1.0, 2.0, 0.5]))
+    return Motion(rotations, translations, 30.0, "dance")
+
+
+def test_the_future_never_changes_the_past(avatar):
+    motion = dance(12)
+    changed = motion.rotations.clone()
+    changed[8:] += 0.5
+    other = dataclasses.replace(motion, rotations=changed)
+    pairs = zip(roll_out(avatar, motion), roll_out(avatar, other), strict=True)
+    for frame, ((_, one), (_, two)) in enumerate(pairs):
+        same = all(torch.equal(getattr(one, f.name), getattr(two, f.name)) for f in dataclasses.fields(one))
+        assert same == (frame < 8)
+
+
+def test_turning_and_shifting_the_motion_turns_and_shifts_the_gaussians(avatar):
+    motion, turn = dance(10), matrix_from_axis_angle(torch.tensor([0.0, 1.3, 0.0]))
+    shift = torch.tensor([2.0, 0.0, -1.0])
+    turned = turn_motion(motion, avatar.body, turn)
+    turned = dataclasses.replace(turned, translations=turned.translations + shift)
+    for (_, one), (_, two) in zip(roll_out(avatar, motion), roll_out(avatar, turned), strict=True):
+        assert torch.allclose(two.means, one.means @ turn.T + shift, atol=2e-4)
+        assert torch.allclose(
+            matrix_from_quaternion(two.rotations), turn @ matrix_from_quaternion(one.rotations), atol=2e-3
+        )
+        assert torch.allclose(two.scales, one.scales, rtol=2e-3)
+        assert torch.allclose(two.harmonics[:, 0], one.harmonics[:, 0], atol=2e-3)
+
+
+def test_a_range_of_frames_has_the_same_history_as_the_whole(avatar):
+    motion = dance(12)
+    whole = dict(roll_out(avatar, motion))
+    part = dict(roll_out(avatar, motion, frames=[1009, 1004]))
+    assert list(part) == [1004, 1009]
+    for frame, gaussians in part.items():
+        assert torch.equal(gaussians.means, whole[frame].means)
+
+
+def test_frames_outside_the_motion_and_foreign_rates_are_refused(avatar):
+    with pytest.raises(MotionError, match="1001-1012"):
+        roll_out(avatar, dance(12), frames=[1013])
+    with pytest.raises(MotionError, match="24 fps"):
+        roll_out(avatar, dataclasses.replace(dance(12), fps=24.0))
+
+
+def test_two_thousand_frames_stay_finite_and_bounded(avatar):
+    motion = dance(2000)
+    track, state, largest = avatar.track(motion), avatar.start(), []
+    from dsar.avatar.avatar import contexts
+
+    with torch.no_grad():
+        for frame in range(len(motion)):
+            output, state, _ = avatar.advance(contexts(track, torch.tensor([frame])), state)
+            largest.append(float(output.offset.abs().max()))
+            assert output.appearance.isfinite().all()
+    assert max(largest) <= avatar.model.offset_limit
+    # Bounded is not enough: the last quarter must not be worse than the second.
+    assert sum(largest[1500:]) <= 1.2 * sum(largest[500:1000])
+
+
+def test_a_teleport_cannot_explode_the_network(avatar):
+    motion = dance(20)
+    translations = motion.translations.clone()
+    translations[10:] += torch.tensor([100.0, 0.0, 0.0])
+    for _, gaussians in roll_out(avatar, dataclasses.replace(motion, translations=translations)):
+        assert gaussians.means.isfinite().all()
+        gap = gaussians.means - gaussians.means.median(0).values
+        assert gap.norm(dim=1).max() < 3

@@ -1,0 +1,61 @@
+"""Texels lie where their UV triangle says, weights stay weights, and cells find their texels."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from dsar.avatar.avatar import grid_cells
+from dsar.body.atlas import Atlas, body_chart, rasterize_uv, smooth_weights
+from dsar.body.files import load_body
+from dsar.errors import BodyError
+
+
+@pytest.fixture(scope="module")
+def body():
+    return load_body()
+
+
+def test_barycentrics_reproduce_the_texel_centre(body):
+    resolution = 64
+    faces, barycentrics = rasterize_uv(body, resolution)
+    covered = faces >= 0
+    uv = torch.einsum("nk,nkc->nc", barycentrics[covered], body.uv[body.uv_faces[faces[covered]]])
+    row, column = covered.nonzero().unbind(1)
+    centers = torch.stack([(column + 0.5) / resolution, 1 - (row + 0.5) / resolution], -1)
+    assert torch.allclose(uv, centers, atol=1e-6)
+    assert barycentrics[covered].min() >= -1e-8
+
+
+def test_charts_stack_without_mixing(body):
+    chart = body_chart(body, 32)
+    atlas = Atlas.stack([chart, chart])
+    count = int(chart.covered.sum())
+    assert (atlas.height, atlas.width, len(atlas)) == (64, 32, 2 * count)
+    assert torch.equal(atlas.texels[count:], atlas.texels[:count] + 32 * 32)
+    assert torch.allclose(atlas.weights.sum(1), torch.ones(2 * count), atol=1e-5)
+
+
+def test_smoothed_weights_still_sum_to_one_and_are_smoother(body):
+    smooth = smooth_weights(body, 10)
+    assert torch.allclose(smooth.sum(1), torch.ones(len(smooth)), atol=1e-5)
+
+    def roughness(weights):
+        return (weights[body.faces[:, 0]] - weights[body.faces[:, 1]]).square().sum()
+
+    assert roughness(smooth) < 0.5 * roughness(body.weights)
+
+
+def test_uv_outside_the_square_is_refused(body):
+    outside = dataclasses.replace(body, uv=body.uv + 5)
+    with pytest.raises(BodyError, match="UV map"):
+        body_chart(outside, 16)
+
+
+def test_every_occupied_cell_holds_a_texel_of_its_own(body):
+    atlas = Atlas.stack([body_chart(body, 64)])
+    cells, nearest = grid_cells(atlas, 4)
+    texel = atlas.texels[nearest]
+    assert torch.equal(texel // 64 // 4 * 16 + texel % 64 // 4, cells)
+    assert len(cells.unique()) == len(cells)
+    assert set((atlas.texels // 64 // 4 * 16 + atlas.texels % 64 // 4).tolist()) == set(cells.tolist())

@@ -1,0 +1,85 @@
+"""Losses against independent implementations and their own definitions."""
+
+import numpy as np
+import torch
+from scipy.ndimage import gaussian_filter
+
+from dsar.config import LossConfig
+from dsar.network import NetworkOutput
+from dsar.training.losses import TemporalRecord, pyramid_l1, ssim, temporal_loss
+
+
+def images(seed=0, size=(40, 33)):
+    generator = torch.Generator().manual_seed(seed)
+    a = torch.rand(*size, 3, generator=generator)
+    return a, (a + 0.2 * torch.randn(*size, 3, generator=generator)).clamp(0, 1)
+
+
+def test_ssim_equals_its_published_definition():
+    a, b = images()
+
+    def blur(x):
+        # truncate 5 / 1.5 gives the 11-pixel window; constant mode is zero padding.
+        return gaussian_filter(x, (1.5, 1.5, 0), truncate=5 / 1.5, mode="constant")
+
+    x, y = a.double().numpy(), b.double().numpy()
+    mx, my = blur(x), blur(y)
+    vx, vy, vxy = blur(x * x) - mx**2, blur(y * y) - my**2, blur(x * y) - mx * my
+    c1, c2 = 0.01**2, 0.03**2
+    expected = np.mean((2 * mx * my + c1) * (2 * vxy + c2) / ((mx**2 + my**2 + c1) * (vx + vy + c2)))
+    assert abs(float(ssim(a, b)) - expected) < 1e-5
+    assert abs(float(ssim(a, a)) - 1) < 1e-6
+
+
+def test_pyramid_sees_a_shift_that_plain_l1_cannot_order():
+    stripes = (torch.arange(64) // 4 % 2).float()[None, :, None].expand(64, 64, 3)
+    near = torch.roll(stripes, 1, 1)
+    blank = torch.full_like(stripes, 0.5)
+    assert pyramid_l1(stripes, stripes, 4) == 0
+    assert pyramid_l1(near, stripes, 1) == (near - stripes).abs().mean()
+    far = torch.roll(stripes, 4, 1)
+    assert pyramid_l1(far, stripes, 1) > pyramid_l1(near, stripes, 1)
+    assert pyramid_l1(blank, stripes, 4) < pyramid_l1(blank, stripes, 1)
+
+
+def record(offset, *, speed=0.0, posed=0.0, feature=0.0, cells=4):
+    b = len(offset)
+    output = NetworkOutput(offset, torch.zeros(b, 11, 2, 2), (torch.full((b, 3, 2, 2), feature),))
+    return TemporalRecord(output, torch.full((b, cells, 3), posed), torch.full((b, 1, 2, 2), speed))
+
+
+def loss(records, ages, **weights):
+    config = LossConfig(
+        **({"feature": 0.0, "prediction": 0.0, "smoothness": 0.0, "temporal_scale": 1.0} | weights)
+    )
+    return float(temporal_loss(records, ages, torch.ones(1, 1, 2, 2), torch.arange(4), config))
+
+
+def test_prediction_loss_counts_a_centimetre_as_one():
+    still, moved = torch.zeros(1, 3, 2, 2), torch.zeros(1, 3, 2, 2)
+    moved[:, 0] = 0.01
+    assert abs(loss([record(still), record(moved)], [5], prediction=1.0) - 1.0) < 1e-6
+
+
+def test_a_fresh_rollout_is_not_compared_with_the_one_before_it():
+    still, moved = torch.zeros(2, 3, 2, 2), torch.ones(2, 3, 2, 2)
+    both = loss([record(still), record(moved)], [5, 5], prediction=1.0)
+    one = loss([record(still), record(moved)], [0, 5], prediction=1.0)
+    assert abs(one - both / 2) < 1e-3
+
+
+def test_smoothness_is_zero_for_steady_motion_and_needs_three_frames():
+    zero = torch.zeros(1, 3, 2, 2)
+    steady = [record(zero, posed=p) for p in (0.0, 0.1, 0.2)]
+    jolt = [record(zero, posed=p) for p in (0.0, 0.1, 0.1)]
+    assert loss(steady, [5], smoothness=1.0) < 1e-8
+    assert abs(loss(jolt, [5], smoothness=1.0) - 3 * 10.0**2) < 1e-2
+    assert loss(jolt, [1], smoothness=1.0) == 0
+
+
+def test_motion_anywhere_in_the_record_loosens_the_weight():
+    still, moved = torch.zeros(1, 3, 2, 2), torch.full((1, 3, 2, 2), 0.01)
+    rest = loss([record(still), record(moved)], [5], prediction=1.0)
+    after_a_stop = loss([record(still, speed=0.01), record(moved)], [5], prediction=1.0)
+    # 0.01 m a frame at 30 fps is 0.3 m/s: the weight's 1/e point.
+    assert abs(after_a_stop / rest - np.exp(-1)) < 1e-5

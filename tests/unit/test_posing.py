@@ -1,0 +1,42 @@
+"""Posing: rotations that are rotations, and Gaussians that move as rigidly as the bones."""
+
+import torch
+
+from dsar.avatar.posing import nearest_quaternions, pose_gaussians
+from dsar.avatar.template import GaussianParameters
+from dsar.geometry.rotations import matrix_from_axis_angle, matrix_from_quaternion, nearest_rotation
+
+
+def test_kernel_finds_the_polar_factor_of_blended_bones():
+    generator = torch.Generator().manual_seed(0)
+    turns = matrix_from_axis_angle(torch.randn(3, 500, 2, 3, generator=generator))
+    share = torch.rand(3, 500, 1, 1, generator=generator)
+    blended = share * turns[:, :, 0] + (1 - share) * turns[:, :, 1]
+    # Opposite bones blend to nothing; such matrices have no nearest rotation to speak of.
+    sane = torch.linalg.det(blended) > 0.05
+    fast = matrix_from_quaternion(nearest_quaternions(blended).double())
+    exact = nearest_rotation(blended.double())
+    assert sane.float().mean() > 0.5
+    assert (fast - exact)[sane].abs().max() < 1e-5
+
+
+def test_a_rigid_move_carries_means_covariances_and_radiance():
+    torch.manual_seed(0)
+    template = GaussianParameters(torch.randn(20, 3), sh_degree=1)
+    with torch.no_grad():
+        template.log_scales.add_(torch.randn(20, 3))
+        template.quaternions.add_(torch.randn(20, 4))
+        template.harmonics.add_(torch.randn(20, 4, 3))
+    turn, shift = matrix_from_axis_angle(torch.tensor([0.3, -1.0, 0.7])), torch.tensor([1.0, 2.0, 3.0])
+    rigid = torch.cat([turn, shift[:, None]], 1).expand(1, 20, 3, 4)
+    still = torch.cat([torch.eye(3), torch.zeros(3, 1)], 1).expand(1, 20, 3, 4)
+    rest, moved = (pose_gaussians(template.activate(), blended)[0] for blended in (still, rigid))
+    assert torch.allclose(moved.means, rest.means @ turn.T + shift, atol=1e-5)
+
+    def covariance(gaussians):
+        axes = matrix_from_quaternion(gaussians.rotations) * gaussians.scales[:, None]
+        return axes @ axes.mT
+
+    assert torch.allclose(covariance(moved), turn @ covariance(rest) @ turn.T, atol=1e-6)
+    assert torch.allclose(moved.harmonics[:, 0], rest.harmonics[:, 0])
+    assert not torch.allclose(moved.harmonics[:, 1:], rest.harmonics[:, 1:], atol=1e-2)

@@ -1,0 +1,71 @@
+"""Stages of training and the rollouts' places."""
+
+import numpy as np
+import pytest
+
+from dsar.config import PRESETS, ScheduleConfig, TrainConfig, config_from_json, config_to_json
+from dsar.errors import ConfigError
+from dsar.training.stages import WHOLE_CLIP, position
+from dsar.training.streams import Streams
+
+
+def test_stages_follow_each_other_and_the_horizon_only_grows():
+    schedule = ScheduleConfig()
+    walk = [position(schedule, i / 1000, i) for i in range(1000)]
+    stages = [p.stage for p in walk]
+    assert stages == sorted(stages, key=["template", "pose", "autoregressive"].index)
+    horizons = [p.horizon for p in walk if p.stage == "autoregressive"]
+    assert horizons == sorted(horizons)
+    assert horizons[0] == schedule.horizon
+    assert horizons[-1] == WHOLE_CLIP
+    assert sum(h == WHOLE_CLIP for h in horizons) >= 0.45 * len(horizons)
+    assert walk[-1].network_rate < 0.03 * schedule.learning_rate
+
+
+def test_rollouts_restart_at_the_horizon_and_at_the_end_of_a_clip():
+    streams = Streams({"a": range(0, 10), "b": range(5, 8)}, 3)
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        places, fresh = streams.next_frames(rng, 4)
+        for place, restarted in zip(places, fresh, strict=True):
+            assert place.frame in streams.clips[place.sequence]
+            assert place.age < 4
+            assert restarted == (place.age == 0)
+        streams.advance()
+
+
+def test_a_whole_clip_starts_at_its_first_frame_and_is_seen_to_its_end():
+    streams = Streams({"a": range(3, 10)}, 1)
+    rng = np.random.default_rng(0)
+    seen = []
+    for _ in range(14):
+        (place,), _ = streams.next_frames(rng, WHOLE_CLIP)
+        seen.append(place.frame)
+        streams.advance()
+    assert seen == [*range(3, 10)] * 2
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_presets_are_consistent_and_survive_json(preset, tmp_path):
+    config = PRESETS[preset]
+    config.validate()
+    path = tmp_path / "config.json"
+    path.write_text(config_to_json(config))
+    assert config_from_json(path) == config
+
+
+def test_contradictory_settings_are_refused_before_any_work():
+    import dataclasses
+
+    config = TrainConfig()
+    with pytest.raises(ConfigError, match="multiple of 16"):
+        dataclasses.replace(config, atlas=dataclasses.replace(config.atlas, resolution=100)).validate()
+    with pytest.raises(ConfigError, match="heads"):
+        dataclasses.replace(config, model=dataclasses.replace(config.model, heads=5)).validate()
+
+
+def test_an_unreadable_config_says_which_file(tmp_path):
+    path = tmp_path / "config.json"
+    path.write_text('{"capture": "embedded", "unknown": 1}')
+    with pytest.raises(ConfigError, match=r"config\.json"):
+        config_from_json(path)

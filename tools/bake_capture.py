@@ -1,0 +1,114 @@
+"""Bake the embedded capture: choreograph, simulate the skirt, render eight views, pack.
+
+    python tools/bake_capture.py --work DIR [--out dsar/data/embedded] [--only NAME ...] [--stage simulate|render|pack]
+
+Needs the `mitsuba` extra and libLLVM >= 19. Every stage keeps its results in DIR and skips what is there.
+The same seed gives the same bytes on the same versions.
+"""
+
+import argparse
+import io
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+from capture.choreography import Take, choreograph
+from capture.cloth import Fabric
+from capture.garment import drape, fit_skirt
+from capture.pack import write_capture
+from PIL import Image
+
+from dsar.body.files import EMBEDDED_BODY, load_body
+from dsar.body.model import Body
+from dsar.body.skinning import forward_kinematics
+
+ROOT = Path(__file__).resolve().parents[1]
+SEED = 7
+DISTURBANCE = 0.6
+"""Wind in m/s that makes the second true run of the test sequences."""
+QUALITY = 78
+
+
+def main() -> None:
+    """Run the stages asked for."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--work", type=Path, required=True)
+    parser.add_argument("--out", type=Path, default=ROOT / "dsar/data/embedded")
+    parser.add_argument("--only", nargs="*", help="sequences to bake; all by default")
+    parser.add_argument("--stage", choices=("simulate", "render", "pack"), help="one stage instead of all")
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    body = load_body()
+    takes, pair = choreograph(body, ROOT / "dsar/data/embedded_motion", SEED)
+    takes = {name: take for name, take in takes.items() if not args.only or name in args.only}
+    args.work.mkdir(parents=True, exist_ok=True)
+    if args.stage in (None, "simulate"):
+        simulate_takes(body, takes, args.work)
+    if args.stage in (None, "render"):
+        render_takes(body, takes, args.work)
+    if args.stage in (None, "pack"):
+        from capture.scene import build_cameras
+
+        pairs = [pair] if pair.sequence in takes else []
+        write_capture(args.out, args.work, body, takes, build_cameras(), pairs)
+
+
+def simulate_takes(body: Body, takes: dict[str, Take], work: Path) -> None:
+    """Write WORK/NAME.RUN.npy for every take; test sequences have a second, slightly disturbed run."""
+    skirt = fit_skirt(body)
+    for name, take in takes.items():
+        for run in range(2 if take.split == "test" else 1):
+            path = work / f"{name}.{run}.npy"
+            if path.exists():
+                continue
+            start = time.monotonic()
+            cloth = drape(body, skirt, take.motion, Fabric(), SEED, DISTURBANCE * run)
+            temporary = path.with_suffix(".tmp.npy")
+            np.save(temporary, cloth)
+            os.replace(temporary, path)
+            print(f"{name} run {run}: {len(cloth)} frames in {time.monotonic() - start:.0f} s", flush=True)
+
+
+def render_takes(body: Body, takes: dict[str, Take], work: Path) -> None:
+    """Write WORK/NAME/CAMERA/FRAME.webp for every frame of run 0 that is not there yet."""
+    from capture.scene import DressedPerson, build_cameras
+    from capture.shading import studio_lighting
+    from capture.wardrobe import dress
+
+    with np.load(EMBEDDED_BODY) as file:
+        layers = dress(body, file["part"], [str(name) for name in file["part_names"]], SEED)
+    person = DressedPerson(layers, fit_skirt(body), studio_lighting(), SEED)
+    cameras = build_cameras()
+    for name, take in takes.items():
+        cloth = np.load(work / f"{name}.0.npy")
+        transforms = forward_kinematics(body, take.motion.rotations, take.motion.translations)
+        for camera in cameras:
+            (work / name / camera.name).mkdir(parents=True, exist_ok=True)
+        start, made = time.monotonic(), 0
+        for frame in range(len(take.motion)):
+            paths = [work / name / camera.name / f"{frame:04d}.webp" for camera in cameras]
+            if all(path.exists() for path in paths):
+                continue
+            person.place(transforms[frame], cloth[frame])
+            for camera, path in zip(cameras, paths, strict=True):
+                _write_webp(path, person.photograph(camera))
+            made += 1
+            if made % 20 == 0:
+                print(
+                    f"{name}: {frame + 1} of {len(take.motion)} frames, {(time.monotonic() - start) / made:.2f} s each",
+                    flush=True,
+                )
+
+
+def _write_webp(path: Path, image: np.ndarray) -> None:
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, "WEBP", quality=QUALITY, method=5)
+    temporary = path.with_suffix(".tmp")
+    temporary.write_bytes(buffer.getvalue())
+    os.replace(temporary, path)
+
+
+if __name__ == "__main__":
+    main()

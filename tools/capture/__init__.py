@@ -1,0 +1,1 @@
+"""The bake of the embedded capture: choreography, cloth, wardrobe, rendering, packing."""

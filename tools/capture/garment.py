@@ -1,0 +1,203 @@
+"""The skirt's cut, how it hangs on the body, and its simulation through one take.
+
+A flared skirt is part of an annulus: the inner arc is sewn to a band around the waist. Metres.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from capture.cloth import Collider, Fabric, build_struts, simulate
+from jaxtyping import Float, Int
+from numpy import ndarray
+
+from dsar.body.model import Body
+from dsar.body.skinning import forward_kinematics, skin_points
+from dsar.types import Motion
+
+COLUMNS, ROWS = 96, 30
+BAND_ROWS = 3
+WAIST_HEIGHT = 0.235
+"""Of the skirt's upper edge in the body's rest frame."""
+LENGTH = 0.50
+FLARE = 2.3
+"""Hem over hip circumference."""
+PRE_ROLL = 75
+_HANDS = range(18, 55)
+_EASE = 30
+
+
+@dataclass(frozen=True)
+class Skirt:
+    """A skirt fitted to a body in its rest pose."""
+
+    band: Float[ndarray, "p 3"]
+    """Rest positions of the rows sewn to the waist, row by row."""
+    band_weights: Float[ndarray, "p j"]
+    """Skinning weights of the band."""
+    pattern: Float[ndarray, "r c 2"]
+    """Flat cut in polar coordinates: radius, angle."""
+    turn: float
+    """Angle of the whole cut."""
+
+    @property
+    def faces(self) -> Int[ndarray, "t 3"]:
+        """Triangles of the closed grid, counter-clockwise seen from outside."""
+        return grid_faces(ROWS, COLUMNS)
+
+
+def grid_faces(rows: int, columns: int) -> Int[ndarray, "t 3"]:
+    """Return the triangles of a grid closed around, row 0 on top, columns running counter-clockwise from above."""
+    row, column = np.meshgrid(np.arange(rows - 1), np.arange(columns), indexing="ij")
+    a, b = row * columns + column, row * columns + (column + 1) % columns
+    c, d = a + columns, b + columns
+    return np.concatenate([np.stack([a, c, b], -1), np.stack([b, c, d], -1)]).reshape(-1, 3).astype(np.int32)
+
+
+def fit_skirt(body: Body) -> Skirt:
+    """Return the skirt cut to the waist of a body."""
+    vertices, weights = body.vertices.numpy().astype(float), body.weights.numpy().astype(float)
+    angle = 2 * np.pi * np.arange(COLUMNS) / COLUMNS
+    spacing = LENGTH / (ROWS - 1)
+    rows = [_waist_ring(vertices, WAIST_HEIGHT - spacing * row, angle) for row in range(BAND_ROWS)]
+    band = np.concatenate(rows)
+    torso = np.abs(vertices[:, 0]) < 0.24
+    distance = np.linalg.norm(band[:, None] - vertices[None, torso], axis=-1)
+    near = np.exp(-0.5 * (distance / 0.03) ** 2) + 1e-12
+    band_weights = near @ weights[torso]
+    top = np.linalg.norm(np.roll(rows[0], -1, 0) - rows[0], axis=1)
+    circumference = top.sum()
+    hip = _hip_circumference(vertices, angle)
+    turn = (FLARE * hip - circumference) / LENGTH
+    radius = circumference / turn + spacing * np.arange(ROWS)
+    start = np.concatenate([[0.0], np.cumsum(top)[:-1]]) * turn / circumference
+    pattern = np.stack(np.broadcast_arrays(radius[:, None], start[None]), -1)
+    return Skirt(band, band_weights / band_weights.sum(1, keepdims=True), pattern, turn)
+
+
+def _section(vertices: Float[ndarray, "v 3"], height: float, angle: Float[ndarray, " c"]) -> Float[ndarray, "c 2"]:
+    """Return the convex outline of the trunk at a height, by azimuth around its middle (x, z)."""
+    slab = vertices[(np.abs(vertices[:, 1] - height) < 0.03) & (np.abs(vertices[:, 0]) < 0.22)][:, [0, 2]]
+    middle = 0.5 * (slab.min(0) + slab.max(0))
+    outward = np.stack([np.sin(angle), np.cos(angle)], -1)
+    support = ((slab - middle) @ outward.T).max(0)
+    # The outline is where the support lines of all directions meet: h n + h' t.
+    spectrum = np.fft.rfft(support)
+    spectrum[8:] = 0
+    slope = np.fft.irfft(spectrum * 1j * np.arange(len(spectrum)), len(angle))
+    tangent = np.stack([np.cos(angle), -np.sin(angle)], -1)
+    outline = np.fft.irfft(spectrum, len(angle))[:, None] * outward + slope[:, None] * tangent
+    return middle + outline
+
+
+def _waist_ring(vertices: Float[ndarray, "v 3"], height: float, angle: Float[ndarray, " c"]) -> Float[ndarray, "c 3"]:
+    outline = _section(vertices, height, angle)
+    outward = np.stack([np.sin(angle), np.cos(angle)], -1)
+    outline = outline + 0.012 * outward
+    return np.stack([outline[:, 0], np.full(len(angle), height), outline[:, 1]], -1)
+
+
+def _hip_circumference(vertices: Float[ndarray, "v 3"], angle: Float[ndarray, " c"]) -> float:
+    outline = _section(vertices, 0.02, angle)
+    return float(np.linalg.norm(np.roll(outline, -1, 0) - outline, axis=1).sum())
+
+
+def prepend_pre_roll(motion: Motion) -> Motion:
+    """Return the motion after an unrecorded rest: eased into from a plain stance, then held still."""
+    still = torch.zeros_like(motion.rotations[:1])
+    still[:, 0] = motion.rotations[0, 0]
+    still[:, 16, 2], still[:, 17, 2] = -0.8, 0.8
+    ease = torch.linspace(0, 1, _EASE)[:, None, None]
+    ease = ease * ease * (3 - 2 * ease)
+    lead = still + ease * (motion.rotations[:1] - still)
+    held = motion.rotations[:1].expand(PRE_ROLL - _EASE, -1, -1)
+    translations = motion.translations[:1].expand(PRE_ROLL, -1)
+    return Motion(
+        torch.cat([lead, held, motion.rotations]), torch.cat([translations, motion.translations]), motion.fps, motion.name
+    )
+
+
+def pose_points(
+    body: Body, motion: Motion, points: Float[ndarray, "n 3"], weights: Float[ndarray, "n j"]
+) -> Float[ndarray, "f n 3"]:
+    """Return rest points carried through every frame of a motion, world metres."""
+    transforms = forward_kinematics(body, motion.rotations, motion.translations)
+    p, w = torch.as_tensor(points, dtype=torch.float32), torch.as_tensor(weights, dtype=torch.float32)
+    return np.stack([skin_points(p, w, T).numpy() for T in transforms])
+
+
+def vertex_normals(vertices: Float[ndarray, "f v 3"], faces: Int[ndarray, "t 3"]) -> Float[ndarray, "f v 3"]:
+    """Return area-weighted unit normals per frame."""
+    a, b, c = (vertices[:, faces[:, k]] for k in range(3))
+    areas = np.cross(b - a, c - a)
+    normals = np.zeros_like(vertices)
+    for k in range(3):
+        np.add.at(normals, (slice(None), faces[:, k]), areas)
+    return normals / (np.linalg.norm(normals, axis=-1, keepdims=True) + 1e-20)
+
+
+def drape(
+    body: Body, skirt: Skirt, motion: Motion, fabric: Fabric, seed: int, disturbance: float = 0.0
+) -> Float[ndarray, "f n 3"]:
+    """Return the skirt's vertices at every recorded frame of a motion.
+
+    Args:
+        body: The body at rest.
+        skirt: The fitted skirt.
+        motion: What the body does from frame 0; the cloth comes to rest before it.
+        fabric: Constants of the cloth.
+        seed: Of the irregularity that the folds start from.
+        disturbance: Peak speed in m/s of a wind that blows during the pre-roll only: a second true run.
+    """
+    rolled = prepend_pre_roll(motion)
+    collider = _build_collider(body, rolled)
+    anchors = pose_points(body, rolled, skirt.band, skirt.band_weights).astype(float)
+    start = _hang(skirt, anchors[0], seed)
+    frames = len(rolled)
+    blow = np.zeros((frames, 3))
+    gust = np.sin(np.linspace(0, np.pi, PRE_ROLL - 25)) * disturbance
+    blow[: PRE_ROLL - 25] = gust[:, None] * np.array([0.8, 0.0, 0.6])
+    struts = build_struts(skirt.pattern, skirt.turn, fabric)
+    run = simulate(start, anchors, struts, (ROWS, COLUMNS), collider, fabric, motion.fps, blow)
+    return np.stack([x for i, x in enumerate(run) if i >= PRE_ROLL]).astype(np.float32)
+
+
+def _hang(skirt: Skirt, band: Float[ndarray, "p 3"], seed: int) -> Float[ndarray, "n 3"]:
+    """Return a cone below the band with the cut's own slope and a slight irregular wave."""
+    rng = np.random.default_rng(seed)
+    rings = band.reshape(BAND_ROWS, COLUMNS, 3)
+    last = rings[-1]
+    outward = last - last.mean(0)
+    outward[:, 1] = 0
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    angle = 2 * np.pi * np.arange(COLUMNS) / COLUMNS
+    wave = sum(rng.uniform(0.5, 1) * np.cos(n * angle + rng.uniform(0, 2 * np.pi)) for n in (5, 7, 8, 11))
+    slope = skirt.turn / (2 * np.pi)
+    drop = LENGTH / (ROWS - 1) * np.arange(1, ROWS - BAND_ROWS + 1)[:, None, None]
+    lateral = outward * (slope + 0.06 * wave[:, None])
+    vertical = np.array([0.0, -np.sqrt(1 - slope**2), 0.0])
+    return np.concatenate([band, (last + drop * (lateral + vertical)).reshape(-1, 3)])
+
+
+def _build_collider(body: Body, motion: Motion) -> Collider:
+    """Return the trunk and legs and arms below the elbow as collision geometry over time."""
+    vertices, weights, faces = body.vertices.numpy(), body.weights.numpy(), body.faces.numpy()
+    lower = (vertices[:, 1] < WAIST_HEIGHT + 0.12) & (vertices[:, 1] > -0.62)
+    hands = weights[:, list(_HANDS)].sum(1) > 0.5
+    keep = lower | hands
+    index = np.cumsum(keep) - 1
+    used = faces[keep[faces].all(1)]
+    local = index[used]
+    posed = pose_points(body, motion, vertices[keep], weights[keep])
+    normals = vertex_normals(posed, local)
+    return Collider(posed.astype(float), normals.astype(float), _neighbours(local, int(keep.sum())))
+
+
+def _neighbours(faces: Int[ndarray, "t 3"], count: int) -> Int[ndarray, "v k"]:
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    edges = np.unique(np.concatenate([edges, edges[:, ::-1]]), axis=0)
+    degree = np.bincount(edges[:, 0], minlength=count)
+    table = np.tile(np.arange(count)[:, None], (1, int(degree.max()) + 1))
+    slot = np.arange(len(edges)) - np.concatenate([[0], np.cumsum(degree)[:-1]])[edges[:, 0]]
+    table[edges[:, 0], slot] = edges[:, 1]
+    return table.astype(np.int64)

@@ -1,0 +1,105 @@
+"""Write the capture folder from the stages' results; docs/capture-format.md describes it."""
+
+import json
+import os
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+from capture.choreography import OneToMany, Take
+from capture.garment import COLUMNS, ROWS, grid_faces
+from jaxtyping import Float, Int
+from numpy import ndarray
+
+from dsar.body.model import Body
+from dsar.data.motion import write_motion
+from dsar.types import Camera
+
+DECIMATION = 2
+GARMENT_UNIT = 0.0005
+"""Garment vertices are stored in half millimetres."""
+
+
+def write_capture(
+    out: Path, work: Path, body: Body, takes: Mapping[str, Take], cameras: Sequence[Camera], pairs: list[OneToMany]
+) -> None:
+    """Write capture.json, motion, images and garment of all takes under `out`.
+
+    Args:
+        out: The capture folder; made if need be.
+        work: Where the simulation and the renderer left NAME.RUN.npy and NAME/CAMERA/FRAME.webp.
+        body: The embedded body.
+        takes: Sequences by name.
+        cameras: The rig.
+        pairs: Frames of equal pose and different cloth.
+    """
+    for folder in ("motion", "images", "garment"):
+        (out / folder).mkdir(parents=True, exist_ok=True)
+    for name, take in takes.items():
+        write_motion(out / "motion" / f"{name}.npz", take.motion, body)
+        _zip_images(out / "images" / f"{name}.zip", work / name, cameras, len(take.motion))
+        _write_garment(out / "garment" / f"{name}.npz", sorted(work.glob(f"{name}.[0-9].npy")))
+    record = {
+        "format": "dsar-capture",
+        "version": 1,
+        "name": "embedded",
+        "fps": next(iter(takes.values())).motion.fps,
+        "cameras": [_describe_camera(camera) for camera in cameras],
+        "body": None,
+        "betas": [],
+        "sequences": {name: _describe_take(name, take) for name, take in takes.items()},
+        "one_to_many": [asdict(pair) for pair in pairs],
+    }
+    temporary = out / ".capture.json.tmp"
+    temporary.write_text(json.dumps(record, indent=1) + "\n")
+    os.replace(temporary, out / "capture.json")
+
+
+def _describe_camera(camera: Camera) -> dict[str, object]:
+    return {
+        "name": camera.name,
+        "K": camera.K.double().numpy().tolist(),
+        "T_camera_world": camera.T_camera_world.double().numpy().tolist(),
+        "width": camera.width,
+        "height": camera.height,
+    }
+
+
+def _describe_take(name: str, take: Take) -> dict[str, object]:
+    return {
+        "motion": f"motion/{name}.npz",
+        "images": f"images/{name}.zip",
+        "frames": len(take.motion),
+        "split": take.split,
+        "labels": list(take.labels),
+        "garment": f"garment/{name}.npz",
+    }
+
+
+def _zip_images(path: Path, folder: Path, cameras: Sequence[Camera], frames: int) -> None:
+    temporary = path.with_suffix(".tmp")
+    with zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
+        for camera in cameras:
+            for frame in range(frames):
+                entry = f"{camera.name}/{frame:04d}.webp"
+                # A fixed date keeps the archive's bytes reproducible.
+                archive.writestr(zipfile.ZipInfo(entry, (2026, 1, 1, 0, 0, 0)), (folder / entry).read_bytes())
+    os.replace(temporary, path)
+
+
+def _write_garment(path: Path, runs: list[Path]) -> None:
+    """Write every run of the garment as int16 steps in time, every second row and column of the grid."""
+    arrays = {f"run{k}": _encode(np.load(run)) for k, run in enumerate(runs)}
+    rows, columns = len(range(0, ROWS, DECIMATION)), COLUMNS // DECIMATION
+    faces = grid_faces(rows, columns)
+    temporary = path.with_suffix(".tmp.npz")
+    np.savez_compressed(temporary, faces=faces, unit=np.float64(GARMENT_UNIT), **arrays)
+    os.replace(temporary, path)
+
+
+def _encode(cloth: Float[ndarray, "f n 3"]) -> Int[ndarray, "f v 3"]:
+    grid = cloth.reshape(len(cloth), ROWS, COLUMNS, 3)[:, ::DECIMATION, ::DECIMATION]
+    levels = np.round(grid.reshape(len(cloth), -1, 3) / GARMENT_UNIT).astype(np.int16)
+    return np.diff(levels, axis=0, prepend=np.zeros_like(levels[:1]))

@@ -1,0 +1,170 @@
+"""From a handful of readable curves (heading, height, arms, lean) to SMPL-X joint rotations.
+
+Feet are planted by two-bone inverse kinematics; they step when the heading leaves them behind.
+World: metres, Y up, person facing +Z at heading zero, angles in radians.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy import ndarray
+from numpy.typing import NDArray
+
+from dsar.geometry.rotations import axis_angle_from_matrix
+from dsar.types import Motion
+
+PELVIS, NECK, HEAD = 0, 12, 15
+SPINES = (3, 6, 9)
+LEGS = ((1, 4, 7), (2, 5, 8))  # hip, knee, ankle of the left and of the right leg
+ARMS = ((16, 18, 20), (17, 19, 21))  # shoulder, elbow, wrist
+FINGERS = (range(25, 37), range(40, 52))  # without thumbs
+Curve = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Score:
+    """The curves of one authored sequence, one value a frame; left and right where there are two columns."""
+
+    heading: Float[ndarray, " f"]
+    """Yaw of the pelvis, radians, continuous over whole turns."""
+    rise: Float[ndarray, " f"]
+    """Pelvis height above standing, metres: negative in a crouch, positive in flight."""
+    shift: Float[ndarray, "f 2"]
+    """Pelvis displacement over the feet along the body's side and front, metres."""
+    abduction: Float[ndarray, "f 2"]
+    """Angle of the upper arms off the body."""
+    swing: Float[ndarray, "f 2"]
+    """Forward swing of the arms."""
+    elbow: Float[ndarray, "f 2"]
+    """Flexion of the elbows."""
+    lean: Float[ndarray, "f 2"]
+    """Bend of the trunk forward and to the left."""
+    twist: Float[ndarray, " f"]
+    """Yaw of the shoulders against the pelvis."""
+    step: float = field(default=np.pi / 2)
+    """Turn after which a foot is set down anew; divides a full turn."""
+
+
+def rotate(axis: int, angle: Float[ndarray, " f"]) -> Float[ndarray, "f 3 3"]:
+    """Return rotations about world axis 0, 1 or 2 (right-handed)."""
+    matrix = np.tile(np.eye(3), (len(angle), 1, 1))
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    matrix[:, i, i] = matrix[:, j, j] = np.cos(angle)
+    matrix[:, i, j], matrix[:, j, i] = -np.sin(angle), np.sin(angle)
+    return matrix
+
+
+def _wrap_angle(angle: Curve) -> Curve:
+    """Return angles in [-pi, pi), rounded so that whole turns give the very same bits."""
+    return np.round(np.remainder(angle + np.pi, 2 * np.pi) - np.pi, 9)
+
+
+def compose_motion(
+    score: Score, joints: Float[ndarray, "j 3"], ground: float, fps: float, name: str
+) -> Motion:
+    """Return the SMPL-X motion of a score.
+
+    Args:
+        score: The curves.
+        joints: Rest joints of the body in metres (55, SMPL-X order, T-pose facing +Z).
+        ground: Height of the soles in the rest pose; they stand on y = 0 in the result.
+        fps: Frame rate.
+        name: Label of the motion.
+    """
+    frames = len(score.heading)
+    local = np.tile(np.eye(3), (frames, len(joints), 1, 1))
+    yaw = rotate(1, _wrap_angle(score.heading))
+    local[:, PELVIS] = yaw @ rotate(0, 0.35 * score.lean[:, 0]) @ rotate(2, 0.35 * score.lean[:, 1])
+    shift = np.stack([score.shift[:, 0], np.zeros(frames), score.shift[:, 1]], -1)
+    pelvis = np.einsum("fij,fj->fi", yaw, shift)
+    pelvis[:, 1] += joints[PELVIS, 1] - ground - 0.015 + score.rise
+    for joint in SPINES:
+        bend = rotate(0, 0.22 * score.lean[:, 0]) @ rotate(2, 0.22 * score.lean[:, 1])
+        local[:, joint] = bend @ rotate(1, score.twist / 3)
+    # The head half undoes the trunk's bend and looks ahead of a turn.
+    local[:, NECK] = rotate(0, -0.25 * score.lean[:, 0]) @ rotate(1, -0.3 * score.twist)
+    local[:, HEAD] = rotate(0, -0.2 * score.lean[:, 0]) @ rotate(2, -0.4 * score.lean[:, 1])
+    _pose_arms(local, score)
+    for side, leg in enumerate(LEGS):
+        _plant_leg(local, score, joints, ground, pelvis, side, leg)
+    rotations = axis_angle_from_matrix(torch.from_numpy(local)).float()
+    return Motion(rotations, torch.from_numpy(pelvis - joints[PELVIS]).float(), fps, name)
+
+
+def _pose_arms(local: Float[ndarray, "f j 3 3"], score: Score) -> None:
+    for side, (shoulder, elbow, wrist) in enumerate(ARMS):
+        mirror = 1.0 if side == 0 else -1.0
+        lower = rotate(2, mirror * (score.abduction[:, side] - np.pi / 2))
+        local[:, shoulder] = rotate(0, -score.swing[:, side]) @ lower
+        local[:, elbow] = rotate(1, -mirror * score.elbow[:, side])
+        still = np.ones(len(local))
+        local[:, wrist] = rotate(2, mirror * 0.08 * still)
+        local[:, list(FINGERS[side])] = rotate(2, -mirror * 0.3 * still)[:, None]
+
+
+def _plant_leg(
+    local: Float[ndarray, "f j 3 3"],
+    score: Score,
+    joints: Float[ndarray, "j 3"],
+    ground: float,
+    pelvis: Float[ndarray, "f 3"],
+    side: int,
+    leg: tuple[int, int, int],
+) -> None:
+    hip, knee, ankle = leg
+    mirror = 1.0 if side == 0 else -1.0
+    yaw, lift = _step_foot(score.heading, score.step, mirror)
+    flight = np.maximum(score.rise, 0.0)
+    foot = rotate(1, _wrap_angle(yaw))
+    target = np.einsum("fij,j->fi", foot, np.array([mirror * 0.105, 0.0, 0.0]))
+    target[:, 1] = joints[ankle, 1] - ground + 0.06 * lift + flight
+    knees_ahead = rotate(1, _wrap_angle(0.5 * (yaw + score.heading)))[:, :, 2]
+    hip_world = pelvis + np.einsum("fij,j->fi", local[:, PELVIS], joints[hip] - joints[PELVIS])
+    thigh, shin = joints[knee] - joints[hip], joints[ankle] - joints[knee]
+    directions = _bend_leg(target - hip_world, np.linalg.norm(thigh), np.linalg.norm(shin), knees_ahead)
+    world_thigh, world_shin = (
+        _frame(direction, knees_ahead) @ _frame(rest[None], np.array([[0.0, 0.0, 1.0]]))[0].T
+        for direction, rest in zip(directions, (thigh, shin), strict=True)
+    )
+    local[:, hip] = np.swapaxes(local[:, PELVIS], 1, 2) @ world_thigh
+    local[:, knee] = np.swapaxes(world_thigh, 1, 2) @ world_shin
+    pointed = rotate(0, np.clip(3.0 * flight + 0.35 * lift, 0.0, 0.7))
+    local[:, ankle] = np.swapaxes(world_shin, 1, 2) @ foot @ pointed
+
+
+def _step_foot(heading: Curve, step: float, mirror: float) -> tuple[Curve, Curve]:
+    """Return a foot's yaw, a softened staircase under the heading, and how far it is lifted (0..1)."""
+    x = heading / step + 0.5 - mirror * 0.25
+    index = np.floor(x)
+    # A foot travels in the outer thirds of a step's turn, half on either side of the tread's end.
+    phase = x - index
+    edge = np.where(phase > 0.5, phase - 1.0, phase)
+    ramp = np.clip(edge / 0.5 + 0.5, 0.0, 1.0)
+    tread = np.where(phase > 0.5, index, index - 1.0) + ramp * ramp * (3 - 2 * ramp)
+    return step * tread + mirror * 0.14, np.sin(np.pi * ramp) ** 2
+
+
+def _bend_leg(
+    reach: Float[ndarray, "f 3"], thigh: float, shin: float, ahead: Float[ndarray, "f 3"]
+) -> tuple[Float[ndarray, "f 3"], Float[ndarray, "f 3"]]:
+    """Return unit directions of thigh and shin that reach from hip to ankle with the knee to the front."""
+    distance = np.linalg.norm(reach, axis=1, keepdims=True)
+    axis = reach / distance
+    distance = np.minimum(distance, 0.9985 * (thigh + shin))
+    front = ahead - axis * np.sum(ahead * axis, 1, keepdims=True)
+    front /= np.linalg.norm(front, axis=1, keepdims=True)
+    along = (thigh**2 - shin**2 + distance**2) / (2 * distance)
+    aside = np.sqrt(np.maximum(thigh**2 - along**2, 0.0))
+    upper = (along * axis + aside * front) / thigh
+    lower = (distance * axis - upper * thigh) / shin
+    return upper, lower / np.linalg.norm(lower, axis=1, keepdims=True)
+
+
+def _frame(down: Float[ndarray, "f 3"], ahead: Float[ndarray, "f 3"]) -> Float[ndarray, "f 3 3"]:
+    """Return rotations whose -Y column is `down` and whose Z column is nearest to `ahead`."""
+    y = -down / np.linalg.norm(down, axis=-1, keepdims=True)
+    x = np.cross(y, np.broadcast_to(ahead, y.shape))
+    x /= np.linalg.norm(x, axis=-1, keepdims=True)
+    return np.stack([x, y, np.cross(x, y)], -1)
