@@ -16,7 +16,7 @@ import tyro
 from dsar.config import PRESETS, AtlasConfig, LossConfig, ModelConfig, ScheduleConfig, TrainConfig
 from dsar.console import Bar, ProgressStyle, follow
 from dsar.errors import ConfigError, DsarError
-from dsar.types import Camera, Capture, GaussianSequence, RenderOutput
+from dsar.types import Camera, GaussianSequence, RenderOutput
 
 Device = Literal["auto", "cpu", "cuda"]
 
@@ -138,12 +138,11 @@ class Drive(Common):
 
     def open(self) -> tuple[GaussianSequence, list[Camera], str]:
         """Return the rollout, the capture's cameras and the motion's name."""
-        from dsar_exporters import parse_frames
-
         from dsar.avatar import roll_out
         from dsar.data.capture import open_capture
         from dsar.data.motion import read_motion, resample
         from dsar.training.checkpoint import Run, load_checkpoint, newest_run
+        from dsar_exporters import parse_frames
 
         self.check_device()
         run = Run(self.run_folder) if self.run_folder else newest_run()
@@ -258,6 +257,7 @@ class Render(Drive):
         """Write the video of all chosen cameras side by side."""
         import numpy as np
         import torch
+
         from dsar_render import display_image, render_sequence, write_mp4
 
         assert self.mp4 is not None
@@ -324,13 +324,13 @@ def write_contact_sheet(folder: Path) -> Path:
     """Write truth above prediction for some frames and cameras of the run's test motion."""
     import numpy as np
     import torch
-    from dsar_render import display_image, render_sequence, write_sheet
 
     from dsar.avatar import roll_out
     from dsar.avatar.rollout import START_FRAME
     from dsar.data.capture import open_capture
     from dsar.evaluation.heldout import true_view
     from dsar.training.checkpoint import Run, load_checkpoint
+    from dsar_render import display_image, render_sequence, write_sheet
 
     avatar, config, _ = load_checkpoint(Run(folder))
     capture = open_capture(config.capture)

@@ -46,7 +46,7 @@ class ModelConfig:
     """Feed acceleration maps (extension; it nearly halves the error of driven cloth)."""
     motion_embedding: bool = True
     """Add the embedding of the motion magnitude to the deepest features."""
-    channels: tuple[int, ...] = (32, 64, 96)
+    channels: tuple[int, ...] = (16, 32, 64)
     """Encoder channels, finest level first; every further level halves the resolution."""
     heads: int = 4
     """Attention heads of both attentions."""
@@ -94,7 +94,7 @@ class LossConfig:
     """L_pred, offsets in centimetres."""
     smoothness: float = 0.05
     """L_sm, accelerations in cm per frame squared."""
-    temporal_scale: float = 0.01
+    temporal_scale: float = 0.001
     """Common factor of the three temporal losses, whose unit the paper does not give."""
     still_speed: float = 0.3
     """tau_reg in m/s: the motion magnitude at which the temporal weight has fallen to 1/e."""
@@ -186,6 +186,7 @@ PRESETS: dict[str, TrainConfig] = {
     "small": TrainConfig(
         preset="small",
         atlas=AtlasConfig(resolution=128, garment_rows=64),
+        model=ModelConfig(channels=(32, 64, 96)),
         schedule=ScheduleConfig(steps=20000, views=2),
     ),
     "paper": TrainConfig(

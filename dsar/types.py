@@ -161,14 +161,25 @@ class GaussianSequence:
 class Capture(Protocol):
     """Multi-view video of one dressed person, as every reader presents it."""
 
-    name: str
-    """Label of the capture."""
-    cameras: Sequence[Camera]
-    """Calibrated cameras, the same for every frame."""
-    motions: Mapping[str, Motion]
-    """Body motion of each sequence, by sequence name."""
-    splits: Mapping[str, Sequence[str]]
-    """Sequence names of `train` and `test` (and of labelled subsets such as `nd`, `fd`)."""
+    @property
+    def name(self) -> str:
+        """Label of the capture."""
+        ...
+
+    @property
+    def cameras(self) -> Sequence[Camera]:
+        """Calibrated cameras, the same for every frame."""
+        ...
+
+    @property
+    def motions(self) -> Mapping[str, Motion]:
+        """Body motion of each sequence, by sequence name."""
+        ...
+
+    @property
+    def splits(self) -> Mapping[str, Sequence[str]]:
+        """Sequence names of `train` and `test`, and of labelled subsets such as `nd` and `fd`."""
+        ...
 
     def image(self, sequence: str, frame: int, camera: int) -> UInt8[np.ndarray, "h w 4"]:
         """Return one image: straight (not premultiplied) sRGB and the mask as alpha."""

@@ -9,6 +9,9 @@ import pytest
 import torch
 from PIL import Image
 
+# Small tensors gain nothing from a second thread and lose much to spinning ones.
+torch.set_num_threads(1)
+
 SIZE = (48, 64)
 FRAMES = {"sway": 12, "turn": 14, "bend": 10}
 
@@ -104,3 +107,26 @@ def tiny_capture(tmp_path_factory) -> Path:
     }
     (folder / "capture.json").write_text(json.dumps(description))
     return folder
+
+
+TINY = [
+    *("--atlas.resolution", "32", "--atlas.garment", "off", "--model.channels", "8", "16"),
+    *("--model.upsample", "2", "--model.heads", "2", "--model.window", "3", "--model.memory", "2"),
+    *("--schedule.horizon", "4", "--progress", "none"),
+]
+
+
+def train_arguments(capture: Path, out: Path, *more: str) -> list[str]:
+    """Return the arguments of a `dsar train` that takes seconds."""
+    return ["train", str(capture), "--out", str(out), *TINY, *more]
+
+
+@pytest.fixture(scope="session")
+def trained(tiny_capture, tmp_path_factory) -> Path:
+    """Return the run folder of an avatar of the tiny capture, trained by one worker."""
+    from dsar.cli import main
+
+    out = tmp_path_factory.mktemp("runs") / "tiny"
+    figures = out.parent / "train.json"
+    main(train_arguments(tiny_capture, out, "--steps", "120", "--workers", "1", "--json", str(figures)))
+    return out

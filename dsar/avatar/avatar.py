@@ -37,6 +37,8 @@ class Avatar(nn.Module):
     map_scale: Tensor
     speed_scale: Tensor
     body_joints: Tensor
+    row_mix: Tensor
+    column_mix: Tensor
 
     def __init__(self, body: Body, atlas: Atlas, model: ModelConfig, fps: float) -> None:
         super().__init__()
@@ -53,6 +55,8 @@ class Avatar(nn.Module):
         self.register_buffer("cells", cells)
         self.register_buffer("control_points", atlas.positions[nearest])
         self.register_buffer("control_weights", atlas.weights[nearest])
+        self.register_buffer("row_mix", interpolation_matrix(size[0], atlas.height), persistent=False)
+        self.register_buffer("column_mix", interpolation_matrix(size[1], atlas.width), persistent=False)
         self.register_buffer("map_mean", torch.zeros(model.map_channels, 1, 1))
         self.register_buffer("map_scale", torch.ones(model.map_channels, 1, 1))
         self.register_buffer("speed_scale", torch.ones(()))
@@ -158,7 +162,8 @@ class Avatar(nn.Module):
     def at_texels(self, maps: Float[Tensor, "b c h w"]) -> Float[Tensor, "b n c"]:
         """Return map values at every Gaussian's texel, bilinear between the network's pixels."""
         if self.model.upsample > 1:
-            maps = nn.functional.interpolate(maps, size=self.atlas_size, mode="bilinear")
+            # Two matrix products, which on a CPU cost a third of interpolate's forward and backward.
+            maps = self.row_mix @ maps @ self.column_mix.mT
         return maps.flatten(2)[:, :, self.texels].transpose(1, 2)
 
 
@@ -173,6 +178,12 @@ def contexts(track: Float[Tensor, "f j 4 4"], frames: Int64[Tensor, " b"]) -> Fl
     """Return frames with their two predecessors, newest first; the first frame precedes itself."""
     index = (frames[:, None] - torch.arange(3)).clamp_min(0)
     return track[index]
+
+
+def interpolation_matrix(coarse: int, fine: int) -> Float[Tensor, "fine coarse"]:
+    """Return the linear map from a line of coarse pixels to fine ones, bilinear between pixel centres."""
+    lines = torch.eye(coarse)[None]
+    return nn.functional.interpolate(lines, size=fine, mode="linear")[0].mT.contiguous()
 
 
 def grid_cells(atlas: Atlas, upsample: int) -> tuple[Int64[Tensor, " p"], Int64[Tensor, " p"]]:

@@ -54,7 +54,8 @@ def fit_garment_chart(
     hem, waist = extent
     rows = torch.linspace(waist, hem, size[0])
     azimuths = _azimuths(size[1])
-    radii = _resample(hull, heights, rows, size[1])
+    # Near the hem the masks' border frays the hull; the cloth goes straight on there.
+    radii = _resample(hull, heights, rows.clamp_min(hem + 4 * STEP), size[1])
     directions = torch.stack([azimuths.sin(), torch.zeros_like(azimuths), azimuths.cos()], -1)
     axis = torch.stack([body.joints[0, 0].expand(size[0]), rows, body.joints[0, 2].expand(size[0])], -1)
     positions = (axis[:, None] + radii[..., None] * directions).reshape(-1, 3)

@@ -47,7 +47,7 @@ class GaussianParameters(nn.Module):
         return means, rotations, log_scales.exp().clamp(*SCALE_RANGE), logits.sigmoid(), harmonics
 
 
-def nearest_distances(points: Float[Tensor, "n 3"], neighbours: int = 3) -> Float[Tensor, " n"]:
+def nearest_distances(points: Float[Tensor, "n 3"], neighbours: int = 6) -> Float[Tensor, " n"]:
     """Return the mean distance of each point to its nearest neighbours, metres."""
     rows = []
     for chunk in points.split(1024):

@@ -38,7 +38,7 @@ class View:
 
 def true_view(capture: Capture, sequence: str, frame: int, camera: int) -> View:
     """Return a true image over white."""
-    pixels = torch.from_numpy(capture.image(sequence, frame, camera)).float() / 255
+    pixels = torch.tensor(capture.image(sequence, frame, camera)).float() / 255
     alpha = pixels[..., 3]
     return View(pixels[..., :3] * alpha[..., None] + (1 - alpha[..., None]), alpha)
 
@@ -67,7 +67,7 @@ def evaluate_sequence(avatar: Avatar, capture: Capture, sequence: str, stride: i
 
 def compare(image: Tensor, template: Tensor, truth: View) -> dict[str, float]:
     """Return the metrics of one predicted view and of the template's."""
-    x0, y0, x1, y1 = mask_box(truth.mask.numpy(), 0)
+    x0, y0, x1, y1 = mask_box(truth.mask.numpy() > 0.5, 0)
     box = (slice(y0, y1), slice(x0, x1))
     return {
         "psnr": psnr(image, truth.color),

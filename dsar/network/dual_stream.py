@@ -71,7 +71,7 @@ class DualStreamNetwork(nn.Module):
         return NetworkState(
             fresh=torch.ones(batch, dtype=torch.bool, device=self.occupied.device),
             window=window,
-            magnitude=zeros(batch, c.window, 1, *coarse),
+            motion=zeros(batch, c.window * c.motion_embedding, c.channels[-1], *coarse),
             offset=zeros(batch, 3, h, w),
             memory=zeros(batch, c.memory, c.channels[-1], *coarse),
         )
@@ -92,13 +92,11 @@ class DualStreamNetwork(nn.Module):
         """
         feedback = state.offset / OFFSET_UNIT if streams else torch.zeros_like(state.offset)
         frames, window = self._encode_window(maps, feedback, state)
-        coarse = nn.functional.adaptive_avg_pool2d(magnitude, tuple(state.magnitude.shape[-2:]))
-        magnitudes = push(state.magnitude, coarse, state.fresh)
-
-        deep = frames[-1]
+        deep, motion = frames[-1], state.motion
         if self.motion_embedding is not None:
-            embedded = self.motion_embedding(magnitudes.flatten(0, 1))
-            deep = deep + embedded.reshape(deep.shape)
+            coarse = nn.functional.adaptive_avg_pool2d(magnitude, (deep.shape[-2], deep.shape[-1]))
+            motion = push(motion, self.motion_embedding(coarse), state.fresh)
+            deep = deep + motion
         aggregate = self.attention(deep[:, -1], deep)
         hidden, memory = aggregate, state.memory
         if self.bank is not None:
@@ -114,7 +112,7 @@ class DualStreamNetwork(nn.Module):
         next_state = NetworkState(
             fresh=torch.zeros_like(state.fresh),
             window=window,
-            magnitude=magnitudes,
+            motion=motion,
             offset=offset,
             memory=memory,
         )

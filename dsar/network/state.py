@@ -21,8 +21,8 @@ class NetworkState:
     """Rollouts that have not seen a frame yet."""
     window: tuple[Float[Tensor, "b n ..."], ...]
     """Per level, oldest first: encodings (wiring `perframe`) or inputs (`shared`) of the last n frames."""
-    magnitude: Float[Tensor, "b n 1 hL wL"]
-    """Motion magnitude V of the last n frames at the coarsest level, oldest first."""
+    motion: Float[Tensor, "b n c hL wL"]
+    """Embedded motion magnitudes m of the last n frames at the coarsest level, oldest first."""
     offset: Float[Tensor, "b 3 h w"]
     """Geometric stream: the previous frame's offset map, canonical metres."""
     memory: Float[Tensor, "b m c hL wL"]

@@ -23,15 +23,15 @@ def rasterize(
 ) -> RenderOutput:
     """Blend Gaussians front to back into colour, alpha and depth (3D Gaussian Splatting, as gsplat 1.5.3).
 
-    A Gaussian is left out, and gets zero gradients, if its centre is nearer than 0.01 m or behind the camera, if
-    its opacity is below 1/255, if a scale is not positive, or if anything about it is not finite.
+    A Gaussian is left out, and gets zero gradients, if its centre is behind the camera or nearer than 0.01 m,
+    if its opacity is below 1/255, if a scale is not positive, or if anything about it is not finite.
 
     Args:
         gaussians: in the world, physical values; quaternions are normalised here.
         camera: OpenCV pinhole without skew. Gets gradients from the reference backend only.
-        background: sRGB shown through what transmittance is left; None leaves the colour premultiplied on black.
-        directions: unit directions in which the harmonics are evaluated (an avatar's are those of its canonical
-            pose); by default from the camera's centre to each mean in the world.
+        background: sRGB that shows through the transmittance left over; by default black.
+        directions: unit directions in which the harmonics are evaluated (an avatar's are those of its
+            canonical pose); by default from the camera's centre to each mean in the world.
         backend: `cpu` (Numba, float32), `reference` (plain torch, any dtype and device, 20 times slower), or
             `auto`: `cpu` for float32 tensors in main memory, else `reference`.
 

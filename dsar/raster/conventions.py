@@ -15,4 +15,4 @@ TRANSMITTANCE_MIN = 1e-4
 NEAR = 0.01
 """Gaussians whose centre is nearer than this (camera z, metres) are not drawn."""
 FRUSTUM_MARGIN = 0.3
-"""The projection is linearised no further outside the image than this, as a share of its half-size in tangents."""
+"""How far outside the image the projection is linearised at most, as a share of the image's half-size."""

@@ -1,7 +1,7 @@
 """The fast backend on the CPU: Numba kernels under one autograd function, float32.
 
-Gradients are written by hand and checked against dsar.raster.reference. Results are the same to the bit for any
-number of threads (`numba.set_num_threads`); with one thread they run in the caller's.
+Gradients are written by hand and checked against dsar.raster.reference. Results are the same to the bit
+for any number of threads (`numba.set_num_threads`); with one thread, all runs in the caller's.
 """
 
 import logging
@@ -41,7 +41,7 @@ def rasterize_cpu(
     background: Float[Tensor, "3"] | None = None,
     directions: Float[Tensor, "n 3"] | None = None,
 ) -> RenderOutput:
-    """Rasterise with the Numba kernels: `dsar.raster.rasterize` without its checks, for float32 on the CPU."""
+    """Rasterise with Numba: `dsar.raster.rasterize` without its checks, for float32 in main memory."""
     _load_kernels()
     return _apply(gaussians, camera, background, directions)
 
@@ -74,8 +74,8 @@ class _Rasterize(torch.autograd.Function):
         n, width, height = len(means), camera.width, camera.height
         view, center = _pack_camera(camera)
         records, bounds = np.empty((n, RECORD_SIZE), np.float32), np.empty((n, 4), np.int32)
-        run_parts(project_part, means, rotations, scales, opacities, view, width, height, records, bounds)
-        run_parts(shade_part, means, harmonics, directions, center, records, bounds)
+        run_parts(_prepare_part, means, rotations, scales, opacities, harmonics, directions,
+                  view, center, width, height, records, bounds)  # fmt: skip
         tiles_x, tiles_y = -(-width // TILE_WIDTH), -(-height // TILE_HEIGHT)
         tile_starts, entries, slots, slot_starts = bin_splats(
             records, bounds, tiles_x, tiles_y, TILE_WIDTH, TILE_HEIGHT
@@ -90,10 +90,9 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *v_outputs: Tensor | None) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *v_outputs: Tensor | None) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         *tensors, color, alpha, depth = ctx.saved_tensors
-        means, rotations, scales, opacities, harmonics = (_as_array(tensor) for tensor in tensors[:5])
-        directions = _as_array(tensors[5], _NO_DIRECTIONS)
+        arrays = [*map(_as_array, tensors[:5]), _as_array(tensors[5], _NO_DIRECTIONS)]
         records, bounds, view, center = ctx.splats
         tile_starts, entries, slots, slot_starts, tiles_x = ctx.bins
         height, width = alpha.shape
@@ -101,20 +100,40 @@ class _Rasterize(torch.autograd.Function):
         v_color, v_alpha, v_depth = map(_as_array, v_outputs, (_NO_COLOR, _NO_IMAGE, _NO_IMAGE))
         slot_sums = np.empty((len(slots), SUMS_SIZE), np.float32)
         run_parts(composite_backward_part, records, tile_starts, entries, slots, tiles_x, *images,
-                           v_color, v_alpha, v_depth, slot_sums)  # fmt: skip
-        sums = np.empty((len(means), SUMS_SIZE), np.float32)
-        run_parts(gather_slots_part, slot_starts, slot_sums, sums)
-        gradients = [None if tensor is None else torch.zeros(tensor.shape) for tensor in tensors[:6]]
-        v_means, v_rotations, v_scales, v_opacities, v_harmonics = (_as_array(v) for v in gradients[:5])
-        v_directions = _as_array(gradients[5], _NO_DIRECTIONS)
-        run_parts(project_backward_part, means, rotations, scales, opacities, view, width, height, bounds, sums,
-                         v_means, v_rotations, v_scales, v_opacities)  # fmt: skip
-        run_parts(shade_backward_part, means, harmonics, directions, center, bounds, sums,
-                       v_harmonics, v_directions, v_means)  # fmt: skip
+                  v_color, v_alpha, v_depth, slot_sums)  # fmt: skip
+        # Zeros from NumPy: torch would fill them with OpenMP threads, which then spin on the cores we need.
+        gradients = [np.zeros(array.shape, np.float32) for array in arrays]
+        sums = np.empty((len(bounds), SUMS_SIZE), np.float32)
+        run_parts(_finish_part, *arrays, view, center, width, height, bounds, slot_starts, slot_sums, sums,
+                  *gradients)  # fmt: skip
+        v_inputs = [torch.from_numpy(gradient) for gradient in gradients]
+        v_directions = None if tensors[5] is None else v_inputs[5]
         v_background = None
         if ctx.needs_input_grad[6] and v_outputs[0] is not None:
             v_background = torch.einsum("hw,hwc->c", 1 - alpha, v_outputs[0])
-        return *gradients, v_background, None
+        return *v_inputs[:5], v_directions, v_background, None
+
+
+def _prepare_part(
+    part, parts, means, rotations, scales, opacities, harmonics, directions,
+    view, center, width, height, records, bounds,
+):  # fmt: skip
+    """Turn one part of the Gaussians into splats."""
+    project_part(part, parts, means, rotations, scales, opacities, view, width, height, records, bounds)
+    shade_part(part, parts, means, harmonics, directions, center, records, bounds)
+
+
+def _finish_part(
+    part, parts, means, rotations, scales, opacities, harmonics, directions,
+    view, center, width, height, bounds, slot_starts, slot_sums, sums,
+    v_means, v_rotations, v_scales, v_opacities, v_harmonics, v_directions,
+):  # fmt: skip
+    """Bring the gradients of one part's splats back to their Gaussians."""
+    gather_slots_part(part, parts, slot_starts, slot_sums, sums)
+    project_backward_part(part, parts, means, rotations, scales, opacities, view, width, height,
+                          bounds, sums, v_means, v_rotations, v_scales, v_opacities)  # fmt: skip
+    shade_backward_part(part, parts, means, harmonics, directions, center,
+                        bounds, sums, v_harmonics, v_directions, v_means)  # fmt: skip
 
 
 def _as_array(tensor: Tensor | None, missing: np.ndarray = _BLACK) -> np.ndarray:
@@ -134,16 +153,15 @@ def _pack_camera(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 
 @cache
 def _load_kernels() -> None:
-    """Load or compile the kernels by rendering one Gaussian, so that the wait is announced and not timed later."""
-    _log.info("Loading the rasteriser; its first use on a machine compiles it (about a minute)")
+    """Load or compile the kernels by rendering one Gaussian, so that the wait can be announced."""
+    _log.info("Loading the rasteriser; its first use on a machine compiles it (about 20 s)")
     start = time.perf_counter()
-    one = Gaussians(
-        torch.tensor([[0.0, 0.0, 1.0]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]]), torch.full((1, 3), 0.1),
-        torch.full((1,), 0.5), torch.zeros(1, 1, 3),
-    )  # fmt: skip
-    camera = Camera(
-        torch.tensor([[8.0, 0.0, 4.0], [0.0, 8.0, 4.0], [0.0, 0.0, 1.0]]), torch.eye(4), 8, 8, "one"
-    )
-    with torch.enable_grad():
-        _apply(one.map(Tensor.requires_grad_), camera, None, None).color.sum().backward()
+    camera = Camera(torch.eye(3), torch.eye(4), 8, 8, "one")
+    # Whatever mode the first caller is in, the backward kernels are wanted too.
+    with torch.inference_mode(False), torch.enable_grad():
+        one = Gaussians(
+            torch.tensor([[0.0, 0.0, 1.0]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]]), torch.ones(1, 3),
+            torch.full((1,), 0.5), torch.zeros(1, 1, 3),
+        ).map(Tensor.requires_grad_)  # fmt: skip
+        _apply(one, camera, None, None).color.sum().backward()
     _log.info("Rasteriser ready after %.1f s", time.perf_counter() - start)

@@ -1,15 +1,28 @@
 """The two decorators of the kernels: how Numba compiles them."""
 
+import inspect
+from collections.abc import Callable
+from typing import Any
+
 from numba import njit
 
-_FASTMATH = {"contract", "reassoc", "nsz", "arcp"}
-"""Freedom to fuse and reorder, so that loops vectorise; NaN and infinity keep their meaning, culling needs them."""
+_OPTIONS = {
+    # Freedom to fuse and reorder, so that loops vectorise. NaN keeps its meaning: culling needs it.
+    "fastmath": {"contract", "reassoc", "nsz", "arcp"},
+    # A division that may raise would stop a loop from vectorising.
+    "error_model": "numpy",
+}
 
-inlined = njit(fastmath=_FASTMATH, error_model="numpy")
-"""A part of a kernel. The NumPy error model, because a division that may raise stops a loop from vectorising."""
 
-kernel = njit(cache=True, nogil=True, fastmath=_FASTMATH, error_model="numpy")
-"""What Python calls: kept on disk once compiled, and able to run in threads.
+def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile a part of a kernel."""
+    # Unwrapped: checks that an import hook put around the function are not for the compiler.
+    return njit(**_OPTIONS)(inspect.unwrap(function))
 
-Numba notices edits of the kernel's own file only, so a kernel calls nothing compiled from another file.
-"""
+
+def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile a function that Python calls: kept on disk once compiled, and able to run beside other threads.
+
+    Numba notices edits of the kernel's own file only, so a kernel calls nothing compiled from another file.
+    """
+    return njit(cache=True, nogil=True, **_OPTIONS)(inspect.unwrap(function))

@@ -79,6 +79,7 @@ def bin_splats(records, bounds, tiles_x, tiles_y, tile_width, tile_height):
 
 @kernel
 def gather_slots_part(part, parts, slot_starts, slot_sums, sums):
+    """Add up each splat's slots."""
     n = len(slot_starts) - 1
     for i in range(n * part // parts, n * (part + 1) // parts):
         for k in range(sums.shape[1]):

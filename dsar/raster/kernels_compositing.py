@@ -4,27 +4,32 @@ A tile's pixels live in one flat array of planes, so that the loop over a splat'
 loop over consecutive memory, which LLVM vectorises: a pixel that is finished stays in the loop, masked. Its
 transmittance is kept negative, which makes every later splat fail the test `T (1 - alpha) > minimum`.
 
-The backward pass walks front to back again and needs one running scalar per pixel: with q the splat's colour and
-depth times the pixel's gradient and `rest` what all splats behind it contribute to the loss,
+The backward pass walks front to back again and needs one running scalar per pixel: with q the splat's colour
+and depth times the pixel's gradient and `rest` what all splats behind it contribute to the loss,
 
     dL/dalpha = q T - rest / (1 - alpha).
+
+Work is dealt out in `parts`: a part writes only its own tiles and their slots, so results do not depend on
+how many there are.
 """
 
+import llvmlite.binding
 import numpy as np
 
 from dsar.raster.conventions import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from dsar.raster.jit import inlined, kernel
-from dsar.raster.kernels_projection import RECORD_SIZE
 
 TILE_WIDTH = 4
-"""One AVX2 register: wider rows spend more lanes outside the splats than they save in tiles."""
 TILE_HEIGHT = 16
+"""Four pixels wide, so that one SIMD register holds a block of rows: small splats leave fewer lanes idle."""
 SUMS_SIZE = 10
 """With v = dL/d(e1² + e2²): sums of v, v e1, v e2, v e1², v e1 e2, v e2²; then dL/d(red, green, blue, z)."""
 
-_BATCH = 16
-_LANES = 8
-_ROWS = _LANES // TILE_WIDTH
+# Pixels that LLVM puts through a register at once (AVX-512: 16 floats); loops run over whole blocks of them.
+_LANES = 16 if llvmlite.binding.get_host_cpu_features().get("avx512f", False) else 8
+_BLOCK_ROWS = _LANES // TILE_WIDTH
+# How many splats pass between two looks at whether a tile is finished.
+_PATIENCE = 16
 _PIXELS = TILE_WIDTH * TILE_HEIGHT
 # Planes of a tile's state. Both passes: transmittance, pixel centre x and y (from the tile's corner).
 _T, _X, _Y = (np.uint64(plane * _PIXELS) for plane in (0, 1, 2))
@@ -38,11 +43,8 @@ _T_MIN = np.float32(TRANSMITTANCE_MIN)
 _ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 # exp(-t / 8) for t in [0, 6] (Chebyshev interpolation, 2e-8); alpha < 1/255 wherever t > 5.55.
 _FALLOFF_MAX = np.float32(6.0)
-_E0, _E1, _E2, _E3, _E4, _E5, _E6 = np.float32(
-    np.polynomial.Chebyshev.interpolate(lambda t: np.exp(-t / 8), 6, domain=[0, 6])
-    .convert(kind=np.polynomial.Polynomial)
-    .coef
-)
+_ROOT = np.polynomial.Chebyshev.interpolate(lambda t: np.exp(-t / 8), 6, domain=[0, 6])
+_E0, _E1, _E2, _E3, _E4, _E5, _E6 = map(np.float32, _ROOT.convert(kind=np.polynomial.Polynomial).coef)
 
 
 @inlined
@@ -86,8 +88,7 @@ def _blend_splat_backward(
     for pixel in range(first, end):
         e1 = e1_origin - stretch * state[pixel + _X] + shear * state[pixel + _Y]
         e2 = e2_origin - height * state[pixel + _Y]
-        peak = opacity * _falloff(e1 * e1 + e2 * e2)
-        alpha = min(peak, _ALPHA_MAX)
+        alpha = min(opacity * _falloff(e1 * e1 + e2 * e2), _ALPHA_MAX)
         before = state[pixel + _T]
         weight = alpha * before if alpha >= _ALPHA_MIN else _ZERO
         running = before - weight > _T_MIN
@@ -101,9 +102,8 @@ def _blend_splat_backward(
         v_green += weight * state[pixel + _V_GREEN]
         v_blue += weight * state[pixel + _V_BLUE]
         v_z += weight * state[pixel + _V_DEPTH]
-        # Where alpha is clamped it does not move with the splat's shape.
-        shaped = peak if weight > _ZERO and peak <= _ALPHA_MAX else _ZERO
-        v = shaped * (rest / (_ONE - alpha) - q * before)
+        # v = -alpha dL/dalpha; where alpha is clamped it does not move with the splat's shape.
+        v = weight * (rest / (before - weight) - q) if alpha < _ALPHA_MAX else _ZERO
         s += v
         s1 += v * e1
         s2 += v * e2
@@ -115,20 +115,12 @@ def _blend_splat_backward(
 
 
 @inlined
-def _copy_batch(batch, records, entries, start, end):
-    """Bring the next splats of a tile together: their scattered records load in parallel here, not one by one."""
-    for j in range(end - start):
-        for k in range(RECORD_SIZE):
-            batch[j, k] = records[entries[start + j], k]
-
-
-@inlined
 def _is_finished(state):
     """Return whether every pixel of a tile has stopped."""
-    largest = -_ONE
+    left = _ZERO
     for pixel in range(_PIXELS):
-        largest = max(largest, state[pixel])
-    return largest <= _ZERO
+        left += state[pixel] if state[pixel] > _ZERO else _ZERO
+    return left == _ZERO
 
 
 @inlined
@@ -151,9 +143,9 @@ def _open_tile(state, left, top, width, height):
 
 @inlined
 def _place(splat, left, top):
-    """Return a splat's pixel range in a tile and its e1, e2 at the tile's corner."""
-    first = max(np.int64(splat[10]) - top, 0) // _ROWS * _LANES
-    end = (min(np.int64(splat[11]) - top, TILE_HEIGHT) + _ROWS - 1) // _ROWS * _LANES
+    """Return a splat's pixel range in a tile, in whole blocks, and its e1, e2 at the tile's corner."""
+    first = max(np.int64(splat[10]) - top, 0) // _BLOCK_ROWS * _LANES
+    end = (min(np.int64(splat[11]) - top, TILE_HEIGHT) + _BLOCK_ROWS - 1) // _BLOCK_ROWS * _LANES
     x, y = splat[0] - np.float32(left), splat[1] - np.float32(top)
     return np.uint64(first), np.uint64(end), splat[2] * x - splat[3] * y, splat[4] * y
 
@@ -175,18 +167,18 @@ def _close_tile(state, left, top, background, color, alpha, depth):
 
 @kernel
 def composite_part(part, parts, records, tile_starts, entries, tiles_x, background, color, alpha, depth):
+    """Blend the splats of every parts-th tile into the images."""
     height, width = alpha.shape
-    state, batch = _new_state(7), np.empty((_BATCH, RECORD_SIZE), np.float32)
+    state = _new_state(7)
     # Neighbouring tiles cost about the same: dealing them out in turn keeps the parts even.
     for tile in range(part, len(tile_starts) - 1, parts):
         left, top = tile % tiles_x * TILE_WIDTH, tile // tiles_x * TILE_HEIGHT
         _open_tile(state, left, top, width, height)
         state[3 * _PIXELS :] = _ZERO
-        for start in range(tile_starts[tile], tile_starts[tile + 1], _BATCH):
-            end = min(start + _BATCH, tile_starts[tile + 1])
-            _copy_batch(batch, records, entries, start, end)
+        for start in range(tile_starts[tile], tile_starts[tile + 1], _PATIENCE):
+            end = min(start + _PATIENCE, tile_starts[tile + 1])
             for j in range(end - start):
-                splat = batch[j]
+                splat = records[entries[start + j]]
                 first, stop, e1, e2 = _place(splat, left, top)
                 _blend_splat(state, first, stop, e1, splat[2], splat[3], e2, splat[4], splat[5],
                              splat[6], splat[7], splat[8], splat[9])  # fmt: skip
@@ -226,22 +218,22 @@ def composite_backward_part(
     part, parts, records, tile_starts, entries, slots, tiles_x,
     color, alpha, depth, v_color, v_alpha, v_depth, slot_sums,
 ):  # fmt: skip
+    """Fill the slots of every parts-th tile with the gradient sums of its splats. Empty v_* mean zero."""
     height, width = alpha.shape
-    state, batch = _new_state(8), np.empty((_BATCH, RECORD_SIZE), np.float32)
+    state = _new_state(8)
     for tile in range(part, len(tile_starts) - 1, parts):
         left, top = tile % tiles_x * TILE_WIDTH, tile // tiles_x * TILE_HEIGHT
         _open_tile(state, left, top, width, height)
         _open_tile_backward(state, left, top, color, alpha, depth, v_color, v_alpha, v_depth)
         finished = False
-        for start in range(tile_starts[tile], tile_starts[tile + 1], _BATCH):
-            end = min(start + _BATCH, tile_starts[tile + 1])
+        for start in range(tile_starts[tile], tile_starts[tile + 1], _PATIENCE):
+            end = min(start + _PATIENCE, tile_starts[tile + 1])
             if finished:
                 for j in range(start, end):
                     slot_sums[slots[j]] = _ZERO
                 continue
-            _copy_batch(batch, records, entries, start, end)
             for j in range(end - start):
-                splat = batch[j]
+                splat = records[entries[start + j]]
                 first, stop, e1, e2 = _place(splat, left, top)
                 _blend_splat_backward(state, first, stop, e1, splat[2], splat[3], e2, splat[4], splat[5],
                                       splat[6], splat[7], splat[8], splat[9],

@@ -1,12 +1,15 @@
 """Numba kernels: Gaussians in the world to splats on the image, and the way back.
 
-A splat's fall-off is kept as the Cholesky factor of its inverse covariance, for a pixel offset d = mean - pixel:
+A splat's fall-off is kept as the Cholesky factor of its inverse covariance. With d = mean - pixel:
 
     e1 = stretch dx - shear dy,  e2 = height dy,  alpha = opacity exp(-(e1² + e2²)).
 
-Unlike the conic (a, b, c) this cannot turn negative by rounding, however thin the splat, and costs a pixel two
-multiply-adds. A splat's record: mean x, mean y, stretch, shear, height, opacity, red, green, blue, z, first row,
-end row. Work is split in `parts`; a part touches only its own rows, so results do not depend on their number.
+Unlike the conic (a, b, c) this cannot turn negative by rounding, however thin the splat. A splat's record is
+mean x, mean y, stretch, shear, height, opacity, red, green, blue, z, first row, end row; the colour is left
+to kernels_shading. Bounds are the pixels first x, end x, first y, end y; all 0 if a Gaussian is not drawn.
+
+Every kernel takes `part` of `parts` and touches only those rows, so results do not depend on their number.
+The camera is 16 numbers: rotation (row-major 9), translation (3), fx, fy, cx, cy.
 """
 
 import math
@@ -17,14 +20,12 @@ from dsar.raster.conventions import ALPHA_MIN, EPS_2D, FRUSTUM_MARGIN, NEAR
 from dsar.raster.jit import inlined, kernel
 
 RECORD_SIZE = 12
-CAMERA_SIZE = 16
-"""Rotation (row-major 9), translation (3), fx, fy, cx, cy."""
-
 _EPS = np.float32(EPS_2D)
 _EPS_SQUARED = np.float32(EPS_2D * EPS_2D)
 _NEAR = np.float32(NEAR)
 _MARGIN = np.float32(0.5 * FRUSTUM_MARGIN)
 _ALPHA_MIN = np.float32(ALPHA_MIN)
+_LARGEST = np.finfo(np.float32).max
 _ZERO, _HALF, _ONE, _TWO = (np.float32(value) for value in (0.0, 0.5, 1.0, 2.0))
 
 
@@ -138,6 +139,7 @@ def _pixel_range(center, radius, size):
 
 @kernel
 def project_part(part, parts, means, rotations, scales, opacities, camera, width, height, records, bounds):
+    """Write the records (all but colours) and bounds of one part of the Gaussians."""
     n = len(means)
     width, height = np.float32(width), np.float32(height)
     for i in range(n * part // parts, n * (part + 1) // parts):
@@ -154,7 +156,8 @@ def project_part(part, parts, means, rotations, scales, opacities, camera, width
         a, b, c, slim = _covariance(m1, m2)
         mean_x = camera[12] * point[0] / point[2] + camera[14]
         mean_y = camera[13] * point[1] / point[2] + camera[15]
-        if not math.isfinite(mean_x + mean_y + a + c + slim + opacity):
+        # Not math.isfinite: it subtracts the value from itself, which the compiler may fold to zero.
+        if not abs(mean_x + mean_y + a + c + slim + opacity) <= _LARGEST:
             continue
         # The splat's alpha is at least ALPHA_MIN exactly where e1² + e2² <= log(opacity / ALPHA_MIN).
         reach = _TWO * math.log(opacity / _ALPHA_MIN) + np.float32(1e-4)
@@ -230,6 +233,7 @@ def project_backward_part(
     part, parts, means, rotations, scales, opacities, camera, width, height, bounds, sums,
     v_means, v_rotations, v_scales, v_opacities,
 ):  # fmt: skip
+    """Write the gradients of one part of the Gaussians; those that were not drawn keep what is there."""
     n = len(means)
     width, height = np.float32(width), np.float32(height)
     for i in range(n * part // parts, n * (part + 1) // parts):

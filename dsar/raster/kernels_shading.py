@@ -14,10 +14,11 @@ _C0, _C1 = np.float32(C0), np.float32(0.4886025119029199)
 _C2A, _C2B, _C2C = (
     np.float32(value) for value in (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
 )
-_C3A, _C3B, _C3C, _C3D, _C3E = (
-    np.float32(value)
-    for value in (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
-)  # fmt: skip
+_C3A, _C3B, _C3C = (
+    np.float32(value) for value in (0.5900435899266435, 2.890611442640554, 0.4570457994644658)
+)
+_C3D, _C3E = np.float32(0.3731763325901154), np.float32(1.445305721320277)
+_LARGEST = np.finfo(np.float32).max
 _ZERO, _HALF, _ONE, _TWO, _THREE, _FOUR, _FIVE, _SIX, _TEN, _FIFTEEN = (
     np.float32(value) for value in (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 10.0, 15.0)
 )
@@ -74,6 +75,7 @@ def _direction(means, directions, center, i):
 
 @kernel
 def shade_part(part, parts, means, harmonics, directions, center, records, bounds):
+    """Write the colours of one part of the records; a colour that is not finite empties the bounds."""
     n, count = len(means), harmonics.shape[1]
     basis = np.empty(count, np.float32)
     basis[0] = _C0
@@ -88,7 +90,8 @@ def shade_part(part, parts, means, harmonics, directions, center, records, bound
             red += basis[k] * harmonics[i, k, 0]
             green += basis[k] * harmonics[i, k, 1]
             blue += basis[k] * harmonics[i, k, 2]
-        if not math.isfinite(red + green + blue):
+        # Not math.isfinite: it subtracts the value from itself, which the compiler may fold to zero.
+        if not abs(red + green + blue) <= _LARGEST:
             bounds[i, 0] = bounds[i, 1] = bounds[i, 2] = bounds[i, 3] = 0
             continue
         records[i, 6], records[i, 7], records[i, 8] = max(red, _ZERO), max(green, _ZERO), max(blue, _ZERO)
@@ -98,6 +101,7 @@ def shade_part(part, parts, means, harmonics, directions, center, records, bound
 def shade_backward_part(
     part, parts, means, harmonics, directions, center, bounds, sums, v_harmonics, v_directions, v_means
 ):
+    """Write the gradient of the harmonics and of given directions; if none were, add it to the means'."""
     n, count = len(means), harmonics.shape[1]
     basis, v_basis = np.empty(count, np.float32), np.empty(count, np.float32)
     basis[0] = _C0

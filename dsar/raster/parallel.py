@@ -1,7 +1,7 @@
-"""Kernels spread over threads: the same result for any number of them, because a part writes only what is its own.
+"""Kernels spread over threads: the same result for any number, because a part writes only what is its own.
 
-Python threads around kernels that release the GIL, rather than Numba's own: those would compile every kernel a
-second time, spin while other processes want the core, and abort in a process forked after the first call.
+Python threads around kernels that release the GIL, rather than Numba's own: those would compile every kernel
+twice, spin while other processes want the core, and abort in a process forked after the first call.
 """
 
 import os
@@ -16,7 +16,7 @@ _MAX_PARTS = 16
 
 
 def run_parts(kernel: Callable[..., None], *arguments: object) -> None:
-    """Run kernel(part, parts, *arguments) for every part, on as many threads as `numba.get_num_threads()` says."""
+    """Run kernel(part, parts, *arguments) for every part, one per thread (`numba.get_num_threads`)."""
     parts = min(numba.get_num_threads(), _MAX_PARTS)
     others = [_pool(os.getpid(), parts).submit(kernel, part, parts, *arguments) for part in range(1, parts)]
     kernel(0, parts, *arguments)

@@ -119,7 +119,11 @@ def load_optimizer(optimizer: torch.optim.Optimizer, folder: Path) -> None:
 
 def save_rollouts(folder: Path, rank: int, tensors: Mapping[str, Tensor], places: Any) -> None:
     """Write one worker's carried state."""
-    save_file({name: t.contiguous() for name, t in tensors.items()}, folder / f"rollouts-{rank}.safetensors")
+    # Some tensors are one (the newest offset is state and record); the file format wants each by itself.
+    copies = {
+        name: tensor.detach().clone(memory_format=torch.contiguous_format) for name, tensor in tensors.items()
+    }
+    save_file(copies, folder / f"rollouts-{rank}.safetensors")
     (folder / f"rollouts-{rank}.json").write_text(json.dumps(places))
 
 

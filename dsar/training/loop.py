@@ -37,10 +37,10 @@ STILL_FRAMES = 48
 """Near-rest frames that the template is fitted to."""
 _TEMPLATE_RATES = {
     "means": 1e-3,
-    "quaternions": 2e-3,
-    "log_scales": 5e-3,
-    "opacity_logits": 2e-2,
-    "harmonics": 1e-2,
+    "quaternions": 5e-3,
+    "log_scales": 1e-2,
+    "opacity_logits": 5e-2,
+    "harmonics": 4e-2,
 }
 
 
@@ -86,7 +86,7 @@ def train(config: TrainConfig, run: Run, *, resume: bool = False, report: Report
         check_same_settings(config, config_from_json(run.config), run)
     run.folder.mkdir(parents=True, exist_ok=True)
     run.config.write_text(config_to_json(config))
-    workers.run_workers(config.workers, _train, (config, run.folder, resume, report))
+    workers.run_workers(config.workers, _train, (config, run.folder, resume), report)
     return run
 
 
@@ -110,7 +110,7 @@ def _train(config: TrainConfig, folder: Path, resume: bool, report: Reporter | N
     if resume:
         avatar, _, _ = ckpt.load_checkpoint(run)
     else:
-        body = load_body(Path(config.body) if config.body else capture.body_path, capture.betas)
+        body = load_body(Path(config.body), capture.betas) if config.body else capture.body
         avatar = Avatar.from_capture(capture, body, config.atlas, config.model)
     lpips = load_lpips("alex") if config.loss.lpips else None
     trainer = SegmentTrainer(config, capture, avatar.train(), training_clips(config, capture), lpips)

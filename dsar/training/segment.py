@@ -85,7 +85,7 @@ class SegmentTrainer:
 
     def carried(self) -> tuple[dict[str, Tensor], list[dict[str, str | int]]]:
         """Return what must survive a restart: the rollouts' state as tensors, and their places."""
-        tensors = {"fresh": self.state.fresh, "magnitude": self.state.magnitude}
+        tensors = {"fresh": self.state.fresh, "motion": self.state.motion}
         tensors |= {"offset": self.state.offset, "memory": self.state.memory}
         tensors |= {f"window.{i}": level for i, level in enumerate(self.state.window)}
         for i, record in enumerate(self.records):
@@ -101,7 +101,7 @@ class SegmentTrainer:
         self.state = NetworkState(
             fresh=tensors["fresh"],
             window=tuple(tensors[f"window.{i}"] for i in range(levels)),
-            magnitude=tensors["magnitude"],
+            motion=tensors["motion"],
             offset=tensors["offset"],
             memory=tensors["memory"],
         )

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from dsar.types import Camera, Capture
@@ -31,24 +31,25 @@ def load_target(capture: Capture, sequence: str, frame: int, camera_index: int, 
 
     Premultiplied pixels are averaged, so that the mask's border stays right.
     """
-    pixels = capture.image(sequence, frame, camera_index).astype(np.float32) / 255
-    alpha = pixels[..., 3:]
-    image = np.concatenate([pixels[..., :3] * alpha, alpha], -1)
-    camera = capture.cameras[camera_index]
+    pixels, camera = capture.image(sequence, frame, camera_index), capture.cameras[camera_index]
+    x0, y0, x1, y1 = (edge // reduction for edge in mask_box(pixels[..., 3], MARGIN * reduction))
+    x1, y1 = max(x1, x0 + 1), max(y1, y0 + 1)
+    inside = slice(y0 * reduction, y1 * reduction), slice(x0 * reduction, x1 * reduction)
+    image = torch.from_numpy(pixels[inside].copy()).permute(2, 0, 1).float() / 255
+    image = torch.cat([image[:3] * image[3:], image[3:]])
     if reduction > 1:
-        h, w = (size // reduction * reduction for size in image.shape[:2])
-        blocks = image[:h, :w].reshape(h // reduction, reduction, w // reduction, reduction, 4)
-        image = blocks.mean((1, 3))
-        camera = dataclasses.replace(camera, width=w, height=h).resized(w // reduction, h // reduction)
-    x0, y0, x1, y1 = mask_box(image[..., 3], MARGIN)
-    crop = torch.from_numpy(np.ascontiguousarray(image[y0:y1, x0:x1]))
-    return Target(crop[..., :3], crop[..., 3], camera.cropped(x0, y0, x1 - x0, y1 - y0))
+        image = torch.nn.functional.avg_pool2d(image, reduction)
+        width, height = camera.width // reduction, camera.height // reduction
+        whole = dataclasses.replace(camera, width=width * reduction, height=height * reduction)
+        camera = whole.resized(width, height)
+    color, alpha = image[:3].permute(1, 2, 0).contiguous(), image[3].contiguous()
+    return Target(color, alpha, camera.cropped(x0, y0, x1 - x0, y1 - y0))
 
 
-def mask_box(alpha: Float[np.ndarray, "h w"], margin: int) -> tuple[int, int, int, int]:
-    """Return (x0, y0, x1, y1) of the mask's bounding box with a margin; the whole image if it is empty."""
+def mask_box(alpha: Shaped[np.ndarray, "h w"], margin: int) -> tuple[int, int, int, int]:
+    """Return (x0, y0, x1, y1) of what is not transparent, with a margin; the whole image if nothing is."""
     h, w = alpha.shape
-    rows, columns = np.flatnonzero(alpha.max(1) > 0.02), np.flatnonzero(alpha.max(0) > 0.02)
+    rows, columns = np.flatnonzero(alpha.any(1)), np.flatnonzero(alpha.any(0))
     if not len(rows):
         return 0, 0, w, h
     x0, x1 = max(int(columns[0]) - margin, 0), min(int(columns[-1]) + 1 + margin, w)

@@ -68,27 +68,30 @@ def share_tensors(tensors: Iterator[Tensor]) -> None:
             dist.broadcast(tensor, 0)
 
 
-def run_workers(count: int, work: Callable[..., None], arguments: tuple[Any, ...]) -> None:
-    """Call `work(*arguments)` in `count` processes joined in a group, this one being the first."""
+def run_workers(count: int, work: Callable[..., None], arguments: tuple[Any, ...], report: Any) -> None:
+    """Call `work(*arguments, report)` in `count` processes joined in a group, this one being the first.
+
+    Only the first worker gets `report`; the others get None in its place.
+    """
     if "RANK" in os.environ:
         with _group("env://", int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"])):
-            work(*arguments)
+            work(*arguments, report if rank() == 0 else None)
         return
     if count == 1:
         with _one_thread():
-            work(*arguments)
+            work(*arguments, report)
         return
     with tempfile.TemporaryDirectory() as folder:
         rendezvous = (Path(folder) / "rendezvous").as_uri()
         context = torch.multiprocessing.get_context("spawn")
         others = [
-            context.Process(target=_work, args=(rendezvous, i, count, work, arguments), daemon=True)
+            context.Process(target=_work, args=(rendezvous, i, count, work, (*arguments, None)), daemon=True)
             for i in range(1, count)
         ]
         for process in others:
             process.start()
         try:
-            _work(rendezvous, 0, count, work, arguments)
+            _work(rendezvous, 0, count, work, (*arguments, report))
         finally:
             for process in others:
                 process.join(timeout=30)

@@ -13,31 +13,13 @@ from safetensors.torch import load_file
 
 from dsar.cli import main
 from dsar.training.checkpoint import Run, load_checkpoint
-
-TINY = [
-    *("--atlas.resolution", "32", "--atlas.garment", "off", "--model.channels", "8", "16"),
-    *("--model.upsample", "2", "--model.heads", "2", "--model.window", "3", "--model.memory", "2"),
-    *("--schedule.horizon", "4", "--progress", "none"),
-]
-
-
-def train_command(capture, out, *more):
-    return ["train", str(capture), "--out", str(out), *TINY, *more]
+from tests.conftest import train_arguments
 
 
 def run_command(*arguments, **options):
     environment = {**os.environ, "PYTHONWARNINGS": "error"}
     command = [sys.executable, "-m", "dsar", *map(str, arguments)]
     return subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True, **options)
-
-
-@pytest.fixture(scope="module")
-def trained(tiny_capture, tmp_path_factory):
-    """Return a run of one worker."""
-    out = tmp_path_factory.mktemp("runs") / "tiny"
-    figures = out.parent / "train.json"
-    main(train_command(tiny_capture, out, "--steps", "120", "--workers", "1", "--json", str(figures)))
-    return out
 
 
 def test_training_leaves_everything_the_contract_names_and_gets_better(trained):
@@ -53,8 +35,8 @@ def test_an_interrupted_run_resumes_to_the_same_bits(tiny_capture, tmp_path):
     """Two workers; SIGINT once training moves, then the same command with --resume."""
     whole, stopped = tmp_path / "whole", tmp_path / "stopped"
     command = ("--steps", "60", "--workers", "2", "--schedule.template-share", "0.1")
-    assert run_command(*train_command(tiny_capture, whole, *command)).wait(240) == 0
-    process = run_command(*train_command(tiny_capture, stopped, *command))
+    assert run_command(*train_arguments(tiny_capture, whole, *command)).wait(240) == 0
+    process = run_command(*train_arguments(tiny_capture, stopped, *command))
     deadline = time.monotonic() + 120
     while not (stopped / "metrics.jsonl").exists() and time.monotonic() < deadline:
         time.sleep(0.01)
@@ -63,7 +45,7 @@ def test_an_interrupted_run_resumes_to_the_same_bits(tiny_capture, tmp_path):
     assert process.returncode == 130, message
     step = json.loads((stopped / "checkpoint" / "progress.json").read_text())["step"]
     assert 20 <= step < 60
-    assert run_command(*train_command(tiny_capture, stopped, *command, "--resume")).wait(240) == 0
+    assert run_command(*train_arguments(tiny_capture, stopped, *command, "--resume")).wait(240) == 0
     for name in ("avatar", "optimizer", "rollouts-0", "rollouts-1"):
         a, b = (load_file(folder / "checkpoint" / f"{name}.safetensors") for folder in (whole, stopped))
         assert a.keys() == b.keys()
@@ -74,7 +56,7 @@ def test_an_interrupted_run_resumes_to_the_same_bits(tiny_capture, tmp_path):
 def test_a_value_that_is_not_finite_stops_the_run_and_is_named(tiny_capture, tmp_path, capsys):
     with pytest.raises(SystemExit) as stop:
         main(
-            train_command(
+            train_arguments(
                 tiny_capture, tmp_path / "run", "--steps", "40", "--workers", "1",
                 "--schedule.learning-rate", "1e38", "--schedule.clip", "1e38",
             )
@@ -88,13 +70,13 @@ def test_a_value_that_is_not_finite_stops_the_run_and_is_named(tiny_capture, tmp
 
 def test_a_run_is_never_overwritten_by_accident(trained, tiny_capture, capsys):
     with pytest.raises(SystemExit) as stop:
-        main(train_command(tiny_capture, trained, "--steps", "5"))
+        main(train_arguments(tiny_capture, trained, "--steps", "5"))
     assert stop.value.code == 2
     assert "--resume" in capsys.readouterr().err
 
 
 def test_resuming_with_other_settings_is_refused(trained, tiny_capture, capsys):
-    arguments = train_command(tiny_capture, trained, "--steps", "120", "--workers", "1", "--resume")
+    arguments = train_arguments(tiny_capture, trained, "--steps", "120", "--workers", "1", "--resume")
     with pytest.raises(SystemExit) as stop:
         main([*arguments, "--model.window", "4"])
     assert stop.value.code == 2

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from dsar.avatar.avatar import grid_cells
+from dsar.avatar.avatar import grid_cells, interpolation_matrix
 from dsar.body.atlas import Atlas, body_chart, rasterize_uv, smooth_weights
 from dsar.body.files import load_body
 from dsar.errors import BodyError
@@ -59,3 +59,10 @@ def test_every_occupied_cell_holds_a_texel_of_its_own(body):
     assert torch.equal(texel // 64 // 4 * 16 + texel % 64 // 4, cells)
     assert len(cells.unique()) == len(cells)
     assert set((atlas.texels // 64 // 4 * 16 + atlas.texels % 64 // 4).tolist()) == set(cells.tolist())
+
+
+def test_interpolation_by_matrices_is_bilinear_interpolation():
+    maps = torch.randn(2, 3, 6, 4, generator=torch.Generator().manual_seed(0))
+    rows, columns = interpolation_matrix(6, 24), interpolation_matrix(4, 16)
+    expected = torch.nn.functional.interpolate(maps, size=(24, 16), mode="bilinear")
+    assert torch.allclose(rows @ maps @ columns.mT, expected, atol=1e-6)

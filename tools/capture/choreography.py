@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from capture.posing import Curve, Score, compose_motion
 from numpy import ndarray
 
+from capture.posing import Curve, Score, compose_motion
 from dsar.body.model import Body
 from dsar.data.motion import read_motion
 from dsar.types import Motion
@@ -20,8 +20,8 @@ from dsar.types import Motion
 FPS = 30.0
 MOCAP = {
     "turn_about": ("cmu_01_01", 212, 104, "train", ()),
-    "walk": ("cmu_01_03", 500, 105, "train", ()),
-    "near": ("cmu_01_03", 848, 75, "test", ("nd",)),
+    "walk": ("cmu_01_03", 1028, 88, "train", ()),
+    "near": ("cmu_01_01", 476, 78, "test", ("nd",)),
 }
 """Name: clip, first frame, frames, split, labels."""
 _DEGREE = np.pi / 180
@@ -70,11 +70,13 @@ def spin_curve(
     heading, ends = np.zeros(frames), []
     for start, turns, tempo in spins:
         cruise = max(1, round(abs(turns) * FPS / tempo - ramp / 2 - stop / 2))
-        speed = np.concatenate([
-            0.5 - 0.5 * np.cos(np.pi * (np.arange(ramp) + 0.5) / ramp),
-            np.ones(cruise),
-            1 - (np.arange(stop) + 0.5) / stop,
-        ])
+        speed = np.concatenate(
+            [
+                0.5 - 0.5 * np.cos(np.pi * (np.arange(ramp) + 0.5) / ramp),
+                np.ones(cruise),
+                1 - (np.arange(stop) + 0.5) / stop,
+            ]
+        )
         travelled = np.cumsum(speed)
         travelled *= turns * 2 * np.pi / travelled[-1]
         end = start + len(speed)
@@ -134,7 +136,13 @@ def jump_curve(frames: int, start: int, height: float) -> Curve:
     t = np.arange(frames)
     flight = height * (1 - ((t - takeoff - half) / half) ** 2)
     ground = key_curve(
-        frames, (start, 0), (start + 6, -0.13), (takeoff, 0), (landing, 0), (landing + 4, -0.11), (landing + 15, 0)
+        frames,
+        (start, 0),
+        (start + 6, -0.13),
+        (takeoff, 0),
+        (landing, 0),
+        (landing + 4, -0.11),
+        (landing + 15, 0),
     )
     return np.where((t > takeoff) & (t < landing), flight, ground)
 
@@ -156,7 +164,9 @@ def _sway(rng: np.random.Generator) -> dict[str, ndarray]:
     return curves
 
 
-def _spin(frames: int, spins: list[tuple[int, float, float]], raised: float, bent: float, rng) -> dict[str, ndarray]:
+def _spin(
+    frames: int, spins: list[tuple[int, float, float]], raised: float, bent: float, rng: np.random.Generator
+) -> dict[str, ndarray]:
     curves = _still(frames)
     curves["heading"], _ = spin_curve(frames, *spins)
     _react_to_spin(curves, raised * _DEGREE, bent)

@@ -24,15 +24,15 @@ class Fabric:
     """Compliance of threads, m/N per unit mass (XPBD alpha)."""
     shear: float = 2e-5
     """Compliance of the grid's diagonals."""
-    bend: float = 4e-4
+    bend: float = 1.2e-4
     """Compliance of the two-apart struts that resist bending."""
-    fold: float = 2e-3
+    fold: float = 5e-4
     """Compliance of the six-apart struts that keep folds few and large."""
-    drag: float = 1.1
+    drag: float = 0.8
     """Quadratic air drag along the normal, 1/m (half air density over area density)."""
-    damping: float = 0.45
+    damping: float = 0.7
     """Linear damping of velocity, 1/s."""
-    viscosity: float = 0.10
+    viscosity: float = 0.14
     """Share of the difference to the neighbours' mean velocity removed a substep."""
     friction: float = 0.35
     """Coulomb coefficient against the body."""

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from capture.cloth import Collider, Fabric, build_struts, simulate
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from capture.cloth import Collider, Fabric, build_struts, simulate
 from dsar.body.model import Body
 from dsar.body.skinning import forward_kinematics, skin_points
 from dsar.types import Motion
@@ -19,6 +19,7 @@ COLUMNS, ROWS = 96, 30
 BAND_ROWS = 3
 WAIST_HEIGHT = 0.235
 """Of the skirt's upper edge in the body's rest frame."""
+HIP_HEIGHT = 0.02
 LENGTH = 0.50
 FLARE = 2.3
 """Hem over hip circumference."""
@@ -47,7 +48,7 @@ class Skirt:
 
 
 def grid_faces(rows: int, columns: int) -> Int[ndarray, "t 3"]:
-    """Return the triangles of a grid closed around, row 0 on top, columns running counter-clockwise from above."""
+    """Return the triangles of a grid closed around; rows go down, columns counter-clockwise from above."""
     row, column = np.meshgrid(np.arange(rows - 1), np.arange(columns), indexing="ij")
     a, b = row * columns + column, row * columns + (column + 1) % columns
     c, d = a + columns, b + columns
@@ -57,49 +58,50 @@ def grid_faces(rows: int, columns: int) -> Int[ndarray, "t 3"]:
 def fit_skirt(body: Body) -> Skirt:
     """Return the skirt cut to the waist of a body."""
     vertices, weights = body.vertices.numpy().astype(float), body.weights.numpy().astype(float)
-    angle = 2 * np.pi * np.arange(COLUMNS) / COLUMNS
     spacing = LENGTH / (ROWS - 1)
-    rows = [_waist_ring(vertices, WAIST_HEIGHT - spacing * row, angle) for row in range(BAND_ROWS)]
+    rows = [_waist_ring(vertices, WAIST_HEIGHT - spacing * row) for row in range(BAND_ROWS)]
     band = np.concatenate(rows)
     torso = np.abs(vertices[:, 0]) < 0.24
     distance = np.linalg.norm(band[:, None] - vertices[None, torso], axis=-1)
     near = np.exp(-0.5 * (distance / 0.03) ** 2) + 1e-12
     band_weights = near @ weights[torso]
-    top = np.linalg.norm(np.roll(rows[0], -1, 0) - rows[0], axis=1)
-    circumference = top.sum()
-    hip = _hip_circumference(vertices, angle)
-    turn = (FLARE * hip - circumference) / LENGTH
+    circumference = _perimeter(rows[0])
+    turn = (FLARE * _perimeter(_section(vertices, HIP_HEIGHT, 0.0)) - circumference) / LENGTH
     radius = circumference / turn + spacing * np.arange(ROWS)
-    start = np.concatenate([[0.0], np.cumsum(top)[:-1]]) * turn / circumference
+    start = turn * np.arange(COLUMNS) / COLUMNS
     pattern = np.stack(np.broadcast_arrays(radius[:, None], start[None]), -1)
     return Skirt(band, band_weights / band_weights.sum(1, keepdims=True), pattern, turn)
 
 
-def _section(vertices: Float[ndarray, "v 3"], height: float, angle: Float[ndarray, " c"]) -> Float[ndarray, "c 2"]:
-    """Return the convex outline of the trunk at a height, by azimuth around its middle (x, z)."""
+def _section(vertices: Float[ndarray, "v 3"], height: float, gap: float) -> Float[ndarray, "n 2"]:
+    """Return the trunk's smooth convex outline (x, z) at a height and a gap off the skin, front to left."""
     slab = vertices[(np.abs(vertices[:, 1] - height) < 0.03) & (np.abs(vertices[:, 0]) < 0.22)][:, [0, 2]]
     middle = 0.5 * (slab.min(0) + slab.max(0))
-    outward = np.stack([np.sin(angle), np.cos(angle)], -1)
-    support = ((slab - middle) @ outward.T).max(0)
-    # The outline is where the support lines of all directions meet: h n + h' t.
-    spectrum = np.fft.rfft(support)
-    spectrum[8:] = 0
-    slope = np.fft.irfft(spectrum * 1j * np.arange(len(spectrum)), len(angle))
-    tangent = np.stack([np.cos(angle), -np.sin(angle)], -1)
-    outline = np.fft.irfft(spectrum, len(angle))[:, None] * outward + slope[:, None] * tangent
-    return middle + outline
+    angle = 2 * np.pi * np.arange(720) / 720
+    outward, along = (
+        np.stack([np.sin(angle), np.cos(angle)], -1),
+        np.stack([np.cos(angle), -np.sin(angle)], -1),
+    )
+    spectrum = np.fft.rfft(((slab - middle) @ outward.T).max(0))
+    spectrum[5:] = 0
+    support, slope = gap + np.fft.irfft(spectrum), np.fft.irfft(spectrum * 1j * np.arange(len(spectrum)))
+    # The outline is the envelope of its support lines: h n + h' t.
+    return middle + support[:, None] * outward + slope[:, None] * along
 
 
-def _waist_ring(vertices: Float[ndarray, "v 3"], height: float, angle: Float[ndarray, " c"]) -> Float[ndarray, "c 3"]:
-    outline = _section(vertices, height, angle)
-    outward = np.stack([np.sin(angle), np.cos(angle)], -1)
-    outline = outline + 0.012 * outward
-    return np.stack([outline[:, 0], np.full(len(angle), height), outline[:, 1]], -1)
-
-
-def _hip_circumference(vertices: Float[ndarray, "v 3"], angle: Float[ndarray, " c"]) -> float:
-    outline = _section(vertices, 0.02, angle)
+def _perimeter(outline: Float[ndarray, "n d"]) -> float:
     return float(np.linalg.norm(np.roll(outline, -1, 0) - outline, axis=1).sum())
+
+
+def _waist_ring(vertices: Float[ndarray, "v 3"], height: float) -> Float[ndarray, "c 3"]:
+    """Return the band's points at a height, evenly spaced and just off the skin."""
+    outline = _section(vertices, height, 0.012)
+    closed = np.concatenate([outline, outline[:1]])
+    steps = np.linalg.norm(np.diff(closed, axis=0), axis=1)
+    travelled = np.concatenate([[0.0], np.cumsum(steps)])
+    target = travelled[-1] * np.arange(COLUMNS) / COLUMNS
+    even = np.stack([np.interp(target, travelled, closed[:, k]) for k in range(2)], -1)
+    return np.stack([even[:, 0], np.full(COLUMNS, height), even[:, 1]], -1)
 
 
 def prepend_pre_roll(motion: Motion) -> Motion:
@@ -113,7 +115,10 @@ def prepend_pre_roll(motion: Motion) -> Motion:
     held = motion.rotations[:1].expand(PRE_ROLL - _EASE, -1, -1)
     translations = motion.translations[:1].expand(PRE_ROLL, -1)
     return Motion(
-        torch.cat([lead, held, motion.rotations]), torch.cat([translations, motion.translations]), motion.fps, motion.name
+        torch.cat([lead, held, motion.rotations]),
+        torch.cat([translations, motion.translations]),
+        motion.fps,
+        motion.name,
     )
 
 
@@ -131,8 +136,9 @@ def vertex_normals(vertices: Float[ndarray, "f v 3"], faces: Int[ndarray, "t 3"]
     a, b, c = (vertices[:, faces[:, k]] for k in range(3))
     areas = np.cross(b - a, c - a)
     normals = np.zeros_like(vertices)
-    for k in range(3):
-        np.add.at(normals, (slice(None), faces[:, k]), areas)
+    for frame, area in zip(normals, areas, strict=True):
+        for k in range(3):
+            np.add.at(frame, faces[:, k], area)
     return normals / (np.linalg.norm(normals, axis=-1, keepdims=True) + 1e-20)
 
 
@@ -171,7 +177,8 @@ def _hang(skirt: Skirt, band: Float[ndarray, "p 3"], seed: int) -> Float[ndarray
     outward[:, 1] = 0
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
     angle = 2 * np.pi * np.arange(COLUMNS) / COLUMNS
-    wave = sum(rng.uniform(0.5, 1) * np.cos(n * angle + rng.uniform(0, 2 * np.pi)) for n in (5, 7, 8, 11))
+    waves = [rng.uniform(0.5, 1) * np.cos(n * angle + rng.uniform(0, 2 * np.pi)) for n in (5, 7, 8, 11)]
+    wave = np.sum(waves, 0)
     slope = skirt.turn / (2 * np.pi)
     drop = LENGTH / (ROWS - 1) * np.arange(1, ROWS - BAND_ROWS + 1)[:, None, None]
     lateral = outward * (slope + 0.06 * wave[:, None])

@@ -1,35 +1,45 @@
 """Write the capture folder from the stages' results; docs/capture-format.md describes it."""
 
+import io
 import json
 import os
 import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from jaxtyping import Float, Int, UInt8
+from numpy import ndarray
+from PIL import Image
+
 from capture.choreography import OneToMany, Take
 from capture.garment import COLUMNS, ROWS, grid_faces
-from jaxtyping import Float, Int
-from numpy import ndarray
-
 from dsar.body.model import Body
 from dsar.data.motion import write_motion
 from dsar.types import Camera
 
+QUALITY = 80
+"""Of the lossy WebP colours; the mask in the alpha channel stays exact."""
 DECIMATION = 2
 GARMENT_UNIT = 0.0005
 """Garment vertices are stored in half millimetres."""
 
 
 def write_capture(
-    out: Path, work: Path, body: Body, takes: Mapping[str, Take], cameras: Sequence[Camera], pairs: list[OneToMany]
+    out: Path,
+    work: Path,
+    body: Body,
+    takes: Mapping[str, Take],
+    cameras: Sequence[Camera],
+    pairs: list[OneToMany],
 ) -> None:
     """Write capture.json, motion, images and garment of all takes under `out`.
 
     Args:
         out: The capture folder; made if need be.
-        work: Where the simulation and the renderer left NAME.RUN.npy and NAME/CAMERA/FRAME.webp.
+        work: Where the simulation and the renderer left NAME.RUN.npy and NAME/CAMERA/FRAME.png.
         body: The embedded body.
         takes: Sequences by name.
         cameras: The rig.
@@ -83,23 +93,46 @@ def _zip_images(path: Path, folder: Path, cameras: Sequence[Camera], frames: int
     with zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
         for camera in cameras:
             for frame in range(frames):
-                entry = f"{camera.name}/{frame:04d}.webp"
+                entry = f"{camera.name}/{frame:04d}"
+                with Image.open(folder / f"{entry}.png") as image:
+                    data = _encode_webp(np.asarray(image))
                 # A fixed date keeps the archive's bytes reproducible.
-                archive.writestr(zipfile.ZipInfo(entry, (2026, 1, 1, 0, 0, 0)), (folder / entry).read_bytes())
+                archive.writestr(zipfile.ZipInfo(f"{entry}.webp", (2026, 1, 1, 0, 0, 0)), data)
     os.replace(temporary, path)
 
 
+def _encode_webp(image: UInt8[ndarray, "h w 4"]) -> bytes:
+    """Return the image as lossy WebP whose silhouette is not stained by what is behind it.
+
+    WebP halves the resolution of colour: the colours are continued past the mask's edge first.
+    """
+    color, known = image[..., :3].astype(np.float32), image[..., 3] > 0
+    for _ in range(4):
+        total, count = np.zeros_like(color), np.zeros(known.shape, np.float32)
+        for axis, step in ((0, 1), (0, -1), (1, 1), (1, -1)):
+            near = np.roll(known, step, axis)
+            total += np.roll(color, step, axis) * near[..., None]
+            count += near
+        grown = ~known & (count > 0)
+        color[grown] = total[grown] / count[grown, None]
+        known |= grown
+    buffer = io.BytesIO()
+    full = np.concatenate([np.round(color).astype(np.uint8), image[..., 3:]], -1)
+    Image.fromarray(full).save(buffer, "WEBP", quality=QUALITY, method=4)
+    return buffer.getvalue()
+
+
 def _write_garment(path: Path, runs: list[Path]) -> None:
-    """Write every run of the garment as int16 steps in time, every second row and column of the grid."""
-    arrays = {f"run{k}": _encode(np.load(run)) for k, run in enumerate(runs)}
-    rows, columns = len(range(0, ROWS, DECIMATION)), COLUMNS // DECIMATION
-    faces = grid_faces(rows, columns)
+    """Write every run as int16 steps in time: every second row up from the hem, every second column."""
+    arrays: dict[str, Any] = {f"run{k}": _encode(np.load(run)) for k, run in enumerate(runs)}
+    arrays["faces"] = grid_faces(ROWS // DECIMATION, COLUMNS // DECIMATION)
+    arrays["unit"] = np.float64(GARMENT_UNIT)
     temporary = path.with_suffix(".tmp.npz")
-    np.savez_compressed(temporary, faces=faces, unit=np.float64(GARMENT_UNIT), **arrays)
+    np.savez_compressed(temporary, **arrays)
     os.replace(temporary, path)
 
 
 def _encode(cloth: Float[ndarray, "f n 3"]) -> Int[ndarray, "f v 3"]:
-    grid = cloth.reshape(len(cloth), ROWS, COLUMNS, 3)[:, ::DECIMATION, ::DECIMATION]
+    grid = cloth.reshape(len(cloth), ROWS, COLUMNS, 3)[:, DECIMATION - 1 :: DECIMATION, ::DECIMATION]
     levels = np.round(grid.reshape(len(cloth), -1, 3) / GARMENT_UNIT).astype(np.int16)
     return np.diff(levels, axis=0, prepend=np.zeros_like(levels[:1]))

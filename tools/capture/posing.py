@@ -4,7 +4,7 @@ Feet are planted by two-bone inverse kinematics; they step when the heading leav
 World: metres, Y up, person facing +Z at heading zero, angles in radians.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -20,6 +20,8 @@ SPINES = (3, 6, 9)
 LEGS = ((1, 4, 7), (2, 5, 8))  # hip, knee, ankle of the left and of the right leg
 ARMS = ((16, 18, 20), (17, 19, 21))  # shoulder, elbow, wrist
 FINGERS = (range(25, 37), range(40, 52))  # without thumbs
+STEP = np.pi / 2
+"""Turn after which a foot is set down anew; divides a full turn."""
 Curve = NDArray[np.float64]
 
 
@@ -43,8 +45,6 @@ class Score:
     """Bend of the trunk forward and to the left."""
     twist: Float[ndarray, " f"]
     """Yaw of the shoulders against the pelvis."""
-    step: float = field(default=np.pi / 2)
-    """Turn after which a foot is set down anew; divides a full turn."""
 
 
 def rotate(axis: int, angle: Float[ndarray, " f"]) -> Float[ndarray, "f 3 3"]:
@@ -115,7 +115,7 @@ def _plant_leg(
 ) -> None:
     hip, knee, ankle = leg
     mirror = 1.0 if side == 0 else -1.0
-    yaw, lift = _step_foot(score.heading, score.step, mirror)
+    yaw, lift = _step_foot(score.heading, mirror)
     flight = np.maximum(score.rise, 0.0)
     foot = rotate(1, _wrap_angle(yaw))
     target = np.einsum("fij,j->fi", foot, np.array([mirror * 0.105, 0.0, 0.0]))
@@ -123,7 +123,9 @@ def _plant_leg(
     knees_ahead = rotate(1, _wrap_angle(0.5 * (yaw + score.heading)))[:, :, 2]
     hip_world = pelvis + np.einsum("fij,j->fi", local[:, PELVIS], joints[hip] - joints[PELVIS])
     thigh, shin = joints[knee] - joints[hip], joints[ankle] - joints[knee]
-    directions = _bend_leg(target - hip_world, np.linalg.norm(thigh), np.linalg.norm(shin), knees_ahead)
+    directions = _bend_leg(
+        target - hip_world, float(np.linalg.norm(thigh)), float(np.linalg.norm(shin)), knees_ahead
+    )
     world_thigh, world_shin = (
         _frame(direction, knees_ahead) @ _frame(rest[None], np.array([[0.0, 0.0, 1.0]]))[0].T
         for direction, rest in zip(directions, (thigh, shin), strict=True)
@@ -134,16 +136,16 @@ def _plant_leg(
     local[:, ankle] = np.swapaxes(world_shin, 1, 2) @ foot @ pointed
 
 
-def _step_foot(heading: Curve, step: float, mirror: float) -> tuple[Curve, Curve]:
+def _step_foot(heading: Curve, mirror: float) -> tuple[Curve, Curve]:
     """Return a foot's yaw, a softened staircase under the heading, and how far it is lifted (0..1)."""
-    x = heading / step + 0.5 - mirror * 0.25
+    x = heading / STEP + 0.5 - mirror * 0.25
     index = np.floor(x)
-    # A foot travels in the outer thirds of a step's turn, half on either side of the tread's end.
+    # A foot travels during half of a step's turn, a quarter on either side of the tread's end.
     phase = x - index
     edge = np.where(phase > 0.5, phase - 1.0, phase)
     ramp = np.clip(edge / 0.5 + 0.5, 0.0, 1.0)
     tread = np.where(phase > 0.5, index, index - 1.0) + ramp * ramp * (3 - 2 * ramp)
-    return step * tread + mirror * 0.14, np.sin(np.pi * ramp) ** 2
+    return STEP * tread + mirror * 0.14, np.sin(np.pi * ramp) ** 2
 
 
 def _bend_leg(

@@ -1,4 +1,4 @@
-"""The cloth's pictures: a watercolour print for the skirt, stripes for the shirt. Colours are linear albedo."""
+"""Pictures on cloth: a watercolour print for the skirt, stripes for the shirt. Colours are linear albedo."""
 
 import numpy as np
 from jaxtyping import Float
@@ -13,7 +13,10 @@ def linear(*srgb: int) -> Float[ndarray, "3"]:
 
 GROUND = linear(112, 150, 148)
 GROUND_DEEP = linear(70, 112, 122)
-BLOOMS = [linear(*c) for c in ((226, 108, 92), (240, 226, 206), (176, 60, 104), (232, 172, 78), (214, 140, 160), (92, 84, 140))]
+BLOOMS = [
+    linear(*c)
+    for c in ((226, 108, 92), (240, 226, 206), (176, 60, 104), (232, 172, 78), (214, 140, 160), (92, 84, 140))
+]
 LEAVES = [linear(*c) for c in ((52, 88, 70), (128, 148, 84))]
 HEM, HEM_LINE = linear(34, 44, 78), linear(236, 226, 204)
 CREAM, NAVY = linear(236, 228, 210), linear(40, 54, 96)

@@ -4,44 +4,42 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from jaxtyping import Float, UInt8
+from numpy import ndarray
+
 from capture.garment import COLUMNS, ROWS, Skirt, grid_faces, vertex_normals
 from capture.prints import paint_skirt
 from capture.shading import Lighting, Stage
 from capture.wardrobe import Layer
-from jaxtyping import Float, UInt8
-from numpy import ndarray
-
 from dsar.body.skinning import skin_points
 from dsar.geometry.cameras import look_at
 from dsar.types import Camera
 
 WIDTH, HEIGHT = 192, 256
-FINE = 3
-"""Painted vertices of the skirt per simulated one, along each side of the grid."""
+FINE_ROWS, FINE_COLUMNS = 2, 3
+"""Painted vertices of the skirt per simulated one, down and around."""
 # azimuth in degrees from the person's front, height and distance in metres, focal length and
 # principal-point shift as shares of the image height and size.
 _RIG = (
-    (4, 1.00, 3.30, 1.28, (0.0, 0.0)),
-    (48, 1.70, 3.25, 1.27, (0.0, 0.0)),
-    (93, 1.05, 3.35, 1.31, (0.06, -0.02)),
-    (137, 1.65, 3.20, 1.24, (0.0, 0.0)),
-    (182, 1.00, 3.30, 1.30, (0.0, 0.0)),
-    (228, 1.72, 3.30, 1.28, (0.0, 0.0)),
-    (271, 0.98, 3.25, 1.26, (-0.05, 0.03)),
-    (316, 1.68, 3.35, 1.32, (0.0, 0.0)),
+    (4, 1.00, 3.30, 1.47, (0.0, 0.0)),
+    (48, 1.70, 3.25, 1.45, (0.0, 0.0)),
+    (93, 1.05, 3.35, 1.49, (0.06, -0.02)),
+    (137, 1.65, 3.20, 1.42, (0.0, 0.0)),
+    (182, 1.00, 3.30, 1.48, (0.0, 0.0)),
+    (228, 1.72, 3.30, 1.47, (0.0, 0.0)),
+    (271, 0.98, 3.25, 1.44, (-0.05, 0.03)),
+    (316, 1.68, 3.35, 1.50, (0.0, 0.0)),
 )
 
 
 def build_cameras() -> list[Camera]:
-    """Return the rig: eight cameras all around at two heights, cam2 and cam6 with shifted principal points."""
+    """Return eight cameras all around at two heights; cam2 and cam6 have shifted principal points."""
     cameras = []
     for index, (azimuth, height, distance, focal, shift) in enumerate(_RIG):
         bearing = np.radians(azimuth)
         position = np.array([distance * np.sin(bearing), height, distance * np.cos(bearing)])
         f = focal * HEIGHT
-        K = torch.tensor(
-            [[f, 0, WIDTH * (0.5 + shift[0])], [0, f, HEIGHT * (0.5 + shift[1])], [0, 0, 1]]
-        )
+        K = torch.tensor([[f, 0, WIDTH * (0.5 + shift[0])], [0, f, HEIGHT * (0.5 + shift[1])], [0, 0, 1]])
         target = np.array([position[0] * 0.02, 0.93, position[2] * 0.02])
         cameras.append(Camera(K, look_at(position, target), WIDTH, HEIGHT, f"cam{index}"))
     return cameras
@@ -57,17 +55,19 @@ class Upsampling:
     def apply(self, values: Float[ndarray, "n k"]) -> Float[ndarray, "m k"]:
         """Return values on the painted grid, row by row."""
         grid = values.reshape(ROWS, COLUMNS, -1)
-        return np.einsum("Rr,rck,Cc->RCk", self.rows, grid, self.columns, optimize=True).reshape(-1, grid.shape[-1])
+        return np.einsum("Rr,rck,Cc->RCk", self.rows, grid, self.columns, optimize=True).reshape(
+            -1, grid.shape[-1]
+        )
 
 
 def build_upsampling() -> Upsampling:
     """Return Catmull-Rom interpolation, closed around and linearly continued at the waist and the hem."""
-    fine_rows = (ROWS - 1) * FINE + 1
-    return Upsampling(_cubic(fine_rows, ROWS, closed=False), _cubic(COLUMNS * FINE, COLUMNS, closed=True))
+    return Upsampling(_cubic(FINE_ROWS, ROWS, closed=False), _cubic(FINE_COLUMNS, COLUMNS, closed=True))
 
 
-def _cubic(fine: int, coarse: int, *, closed: bool) -> Float[ndarray, "f c"]:
-    position = np.arange(fine) / FINE
+def _cubic(factor: int, coarse: int, *, closed: bool) -> Float[ndarray, "f c"]:
+    fine = coarse * factor if closed else (coarse - 1) * factor + 1
+    position = np.arange(fine) / factor
     cell = np.minimum(np.floor(position).astype(int), coarse - (1 if closed else 2))
     t = position - cell
     taps = np.stack(
@@ -107,7 +107,14 @@ class DressedPerson:
         self._upsampling = build_upsampling()
         rows, columns = len(self._upsampling.rows), len(self._upsampling.columns)
         radius = np.repeat(self._upsampling.rows @ skirt.pattern[:, 0, 0], columns)
-        angle = np.tile(np.interp(np.arange(columns) / FINE, np.arange(COLUMNS + 1), [*skirt.pattern[0, :, 1], skirt.turn]), rows)
+        angle = np.tile(
+            np.interp(
+                np.arange(columns) / FINE_COLUMNS,
+                np.arange(COLUMNS + 1),
+                [*skirt.pattern[0, :, 1], skirt.turn],
+            ),
+            rows,
+        )
         albedo = [layer.albedo for layer in layers] + [paint_skirt(radius, angle, skirt.turn, seed)]
         faces = np.concatenate([self._faces, grid_faces(rows, columns) + offsets[-1]])
         self._skirt_faces = skirt.faces

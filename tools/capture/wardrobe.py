@@ -7,18 +7,19 @@ the normals. Rest frame of the body: Y up, facing +Z, metres. Colours are linear
 from dataclasses import dataclass
 
 import numpy as np
-from capture.prints import CREAM, linear, noise, paint_shirt
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
+from capture.prints import CREAM, linear, noise, paint_shirt
 from dsar.body.model import Body
 
 SKIN, BLUSH, LIPS = linear(222, 172, 146), linear(206, 132, 112), linear(176, 84, 84)
 HAIR, HAIR_LIGHT = linear(46, 30, 22), linear(96, 62, 40)
-SOLE, SHOE, LACE = linear(232, 228, 220), linear(150, 58, 52), linear(238, 234, 226)
+SOLE, SHOE = linear(232, 228, 220), linear(150, 58, 52)
 EYE_WHITE, IRIS, BROW = linear(232, 228, 224), linear(52, 36, 26), linear(58, 40, 30)
-_EDGE = 0.011
 HEAD_JOINT, NECK_JOINT = 15, 12
+_HAIRLINE = ([-0.17, -0.10, -0.075, -0.035, 0.0, 0.05], [-0.075, -0.055, -0.01, 0.03, 0.058, 0.066])
+"""Metres in front of the eyes, and above them: nape, behind the ear, over it, temple, forehead."""
 
 
 @dataclass(frozen=True)
@@ -45,12 +46,14 @@ def dress(body: Body, parts: Int[ndarray, " v"], part_names: list[str], seed: in
     rng = np.random.default_rng(seed)
     surface = _refine(body, parts)
     label = {name: surface.parts == k for k, name in enumerate(part_names)}
-    shirt, shoes, hair = _shirt_region(surface), _shoe_region(surface), _hair_region(surface, label)
+    shirt, socks, hair = _shirt_region(surface), _sock_region(surface), _hair_region(surface, label)
+    in_shoe = surface.vertices[:, 1] < surface.vertices[:, 1].min() + 0.07
     skin = Layer(surface.vertices, surface.weights, surface.faces, _paint_skin(surface, label, rng))
-    covered = _erode(shirt | shoes, surface.faces, 2)
+    covered = _erode(shirt | socks | in_shoe, surface.faces, 2)
     layers = [_select(skin, ~covered)]
     layers.append(_cover(surface, shirt, 0.009, 25, paint_shirt(surface.vertices)))
-    layers.append(_cover(surface, shoes, 0.012, 60, _paint_shoes(surface)))
+    layers.append(_cover(surface, socks, 0.006, 10, np.broadcast_to(CREAM, surface.vertices.shape)))
+    layers += [_shape_shoe(surface, side) for side in (0, 1)]
     strands = noise(surface.vertices * np.array([1.0, 0.15, 0.5]), 0.012, rng)
     tint = np.clip(0.35 + 0.25 * strands, 0, 1)[:, None]
     layers.append(_cover(surface, hair, 0.022, 6, HAIR + tint * (HAIR_LIGHT - HAIR), 0.1))
@@ -71,14 +74,15 @@ class _Surface:
 
 
 def _refine(body: Body, parts: Int[ndarray, " v"]) -> _Surface:
-    """Return the body with every edge longer than about a centimetre halved, twice at most."""
+    """Return the body with every long edge halved, thrice at most."""
     vertices, faces = body.vertices.double().numpy(), body.faces.numpy().astype(np.int64)
     weights, parts = body.weights.double().numpy(), parts.astype(np.int64)
-    for _ in range(2):
+    for _ in range(3):
         edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1)
         unique, inverse = np.unique(edges, axis=0, return_inverse=True)
         a, b = unique.T
-        split = np.linalg.norm(vertices[a] - vertices[b], axis=1) > _EDGE
+        middle = 0.5 * (vertices[a] + vertices[b])
+        split = np.linalg.norm(vertices[a] - vertices[b], axis=1) > _edge_length(middle)
         index = np.full(len(unique), -1)
         index[split] = len(vertices) + np.arange(split.sum())
         a, b = a[split], b[split]
@@ -88,6 +92,12 @@ def _refine(body: Body, parts: Int[ndarray, " v"]) -> _Surface:
         faces = _split_faces(faces, index[inverse.reshape(3, -1)].T)
     normals = _normals(vertices, faces)
     return _Surface(vertices, normals, weights, faces, parts, body.joints.double().numpy())
+
+
+def _edge_length(points: Float[ndarray, "e 3"]) -> Float[ndarray, " e"]:
+    """Return the longest edge wanted at points: under a centimetre for the shirt, two on skin."""
+    shirt = (points[:, 1] > 0.14) & (np.abs(points[:, 0]) < 0.33)
+    return np.where(shirt, 0.0085, 0.022)
 
 
 def _split_faces(faces: Int[ndarray, "t 3"], middle: Int[ndarray, "t 3"]) -> Int[ndarray, "s 3"]:
@@ -131,7 +141,8 @@ def _smooth(
         total = np.zeros_like(values)
         np.add.at(total, edges[:, 0], values[edges[:, 1]])
         np.add.at(total, edges[:, 1], values[edges[:, 0]])
-        values = np.where(moves[:, None] & (degree > 0), 0.5 * values + 0.5 * total / np.maximum(degree, 1), values)
+        mean = total / np.maximum(degree, 1)
+        values = np.where(moves[:, None] & (degree > 0), 0.5 * (values + mean), values)
     return values
 
 
@@ -172,12 +183,12 @@ def _cover(
     albedo: Float[ndarray, "n 3"],
     hem: float = 0.45,
 ) -> Layer:
-    """Return a piece of clothing over a region: smoothed and lifted off the skin, at its hem by a share only."""
+    """Return clothing over a region: smoothed and lifted off the skin, at its hem by a share only."""
     faces = surface.faces[region[surface.faces].all(1)]
     rim = _rim(faces)
     inner = _erode(region, surface.faces, 1)
     smooth = _smooth(surface.vertices, faces, inner, rounds)
-    smooth = _smooth(smooth, rim, region, 8)
+    smooth = _smooth(smooth, rim, region, 14)
     normals = _smooth(surface.normals, faces, region, 4)
     # Smoothing shrinks: cloth spans hollows but never sinks into the skin.
     sunk = np.minimum(((smooth - surface.vertices) * surface.normals).sum(1), 0.0)
@@ -201,17 +212,35 @@ def _off_hands(surface: _Surface) -> Bool[ndarray, " n"]:
     return surface.weights[:, 20:22].sum(1) + surface.weights[:, 25:].sum(1) < 0.3
 
 
-def _shoe_region(surface: _Surface) -> Bool[ndarray, " n"]:
-    return surface.vertices[:, 1] < surface.vertices[:, 1].min() + 0.125
+def _sock_region(surface: _Surface) -> Bool[ndarray, " n"]:
+    """Return the ankles, from inside the shoes to the socks' upper edge."""
+    height = surface.vertices[:, 1] - surface.vertices[:, 1].min()
+    return (height > 0.045) & (height < 0.125) & (surface.vertices[:, 2] < surface.joints[7, 2] + 0.075)
 
 
-def _paint_shoes(surface: _Surface) -> Float[ndarray, "n 3"]:
-    height = (surface.vertices[:, 1] - surface.vertices[:, 1].min())[:, None]
-    ahead = (surface.vertices[:, 2] - surface.joints[7, 2])[:, None]
-    laces = (ahead > 0.03) & (ahead < 0.10) & (np.remainder(ahead / 0.022, 1) < 0.45)
-    color = np.where(laces & (height > 0.045), LACE, SHOE)
-    color = np.where(height < 0.024, SOLE, color)
-    return np.where(height > 0.082 - 0.1 * np.clip(ahead, -0.1, 0.0), CREAM, color)
+def _shape_shoe(surface: _Surface, side: int) -> Layer:
+    """Return a shoe: the foot's convex outline, rounded by the leather's thickness."""
+    ground = surface.vertices[:, 1].min()
+    foot = (surface.vertices[:, 1] < ground + 0.075) & (surface.vertices[:, 0] * (1 - 2 * side) > 0)
+    points, weights = surface.vertices[foot], surface.weights[foot]
+    outward, faces = _ball(64, 32)
+    reach = (outward @ points.T) / 0.005
+    share = np.exp(reach - reach.max(1, keepdims=True))
+    share /= share.sum(1, keepdims=True)
+    vertices = share @ points + 0.012 * outward
+    ahead = vertices[:, 2] - surface.joints[7 + side, 2]
+    rubber = (outward[:, 1] < -0.2) | (ahead > 0.135)
+    color = np.where(rubber[:, None], SOLE, SHOE)
+    return Layer(vertices, share @ weights, faces, color)
+
+
+def _ball(around: int, down: int) -> tuple[Float[ndarray, "n 3"], Int[ndarray, "t 3"]]:
+    """Return the vertices of a unit ball and its triangles, counter-clockwise seen from outside."""
+    u, v = np.meshgrid(np.arange(around) * 2 * np.pi / around, np.linspace(0, np.pi, down + 1), indexing="ij")
+    ball = np.stack([np.sin(u) * np.sin(v), np.cos(v), np.cos(u) * np.sin(v)], -1).reshape(-1, 3)
+    a = (np.arange(around)[:, None] * (down + 1) + np.arange(down)).ravel()
+    b = (a + down + 1) % len(ball)
+    return ball, np.concatenate([np.stack([a, a + 1, b], -1), np.stack([a + 1, b + 1, b], -1)])
 
 
 def _eyes(surface: _Surface, label: dict[str, ndarray]) -> list[Float[ndarray, "3"]]:
@@ -224,7 +253,7 @@ def _hair_region(surface: _Surface, label: dict[str, ndarray]) -> Bool[ndarray, 
     x, y, z = surface.vertices.T
     eye = np.mean(_eyes(surface, label), 0)
     forward = z - eye[2]
-    hairline = np.interp(forward, [-0.17, -0.10, -0.075, -0.035, 0.0, 0.05], [-0.075, -0.055, -0.01, 0.03, 0.058, 0.066])
+    hairline = np.interp(forward, *_HAIRLINE)
     ear = (np.abs(x) > 0.066) & (y - eye[1] < 0.02) & (forward > -0.11)
     head = surface.weights[:, [HEAD_JOINT, NECK_JOINT, 22, 23, 24]].sum(1) > 0.9
     return head & (y - eye[1] > hairline) & ~ear & ~label["eye"] & ~label["iris"]
@@ -234,20 +263,18 @@ def _bun(surface: _Surface, hair: Bool[ndarray, " n"], rng: np.random.Generator)
     """Return a knot of hair at the back of the head."""
     head = surface.vertices[hair]
     center = np.array([0.0, head[:, 1].max() - 0.075, head[:, 2].min() - 0.028])
-    u, v = np.meshgrid(np.linspace(0, 2 * np.pi, 41)[:-1], np.linspace(0, np.pi, 21), indexing="ij")
-    ball = np.stack([np.cos(u) * np.sin(v), np.cos(v), np.sin(u) * np.sin(v)], -1).reshape(-1, 3)
+    ball, faces = _ball(40, 20)
     swirl = np.arctan2(ball[:, 1], ball[:, 0]) * 3 + 9 * ball[:, 2]
     vertices = center + ball * np.array([0.043, 0.043, 0.036]) * (1 + 0.05 * np.sin(2 * swirl))[:, None]
     tint = np.clip(0.35 + 0.3 * np.sin(2 * swirl) + 0.1 * rng.normal(size=len(ball)), 0, 1)[:, None]
-    a = (np.arange(40)[:, None] * 21 + np.arange(20)).ravel()
-    b = (a + 21) % (40 * 21)
-    faces = np.concatenate([np.stack([a, b, a + 1], -1), np.stack([a + 1, b, b + 1], -1)])
     weights = np.zeros((len(ball), surface.weights.shape[1]))
     weights[:, HEAD_JOINT] = 1
     return Layer(vertices, weights, faces, HAIR + tint * (HAIR_LIGHT - HAIR))
 
 
-def _paint_skin(surface: _Surface, label: dict[str, ndarray], rng: np.random.Generator) -> Float[ndarray, "n 3"]:
+def _paint_skin(
+    surface: _Surface, label: dict[str, ndarray], rng: np.random.Generator
+) -> Float[ndarray, "n 3"]:
     points = surface.vertices
     mottle = 1 + 0.035 * noise(points, 0.10, rng) + 0.02 * noise(points, 0.025, rng)
     color = SKIN * mottle[:, None]
@@ -265,8 +292,9 @@ def _paint_skin(surface: _Surface, label: dict[str, ndarray], rng: np.random.Gen
         offset = points - eye
         across = offset[:, 0] * side
         arch = 0.0235 + 0.10 * (across + 0.016) - 3.5 * (across + 0.016) ** 2
-        soft = np.clip(1.6 - np.abs(offset[:, 1] - arch) / 0.0036, 0, 1) * np.clip(1.5 - np.abs(across - 0.004) / 0.014, 0, 1)
-        soft = (0.95 * soft * (offset[:, 2] > -0.02))[:, None]
+        thick = np.clip(1.6 - np.abs(offset[:, 1] - arch) / 0.0036, 0, 1)
+        wide = np.clip(1.5 - np.abs(across - 0.004) / 0.014, 0, 1)
+        soft = (0.95 * thick * wide * (offset[:, 2] > -0.02))[:, None]
         color += soft * (BROW - color)
     color[label["lips"]] = LIPS
     color[label["nails"]] = linear(214, 120, 118)

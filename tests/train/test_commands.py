@@ -1,0 +1,134 @@
+"""Every command of the README on a trained run, its files read back by readers that are not ours."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from dsar.data.capture import open_capture
+from PIL import Image
+
+from dsar.body.files import load_body
+from dsar.cli import main
+from dsar.data.motion import write_motion
+
+
+def command(*arguments):
+    main([*map(str, arguments), "--progress", "none"])
+
+
+def failure(capsys, *arguments) -> str:
+    with pytest.raises(SystemExit) as stop:
+        command(*arguments)
+    assert stop.value.code == 2
+    message = capsys.readouterr().err
+    assert message.startswith("dsar: ")
+    assert message.count("\n") == 1
+    return message
+
+
+def test_export_writes_usd_and_ply_of_the_same_frames(trained, tmp_path):
+    from plyfile import PlyData
+    from pxr import Usd, UsdGeom
+
+    command(
+        "export", trained, "--usd", tmp_path / "out.usda", "--ply", tmp_path / "ply", "--json", tmp_path / "j"
+    )
+    facts = json.loads((tmp_path / "j").read_text())
+    stage = Usd.Stage.Open(str(tmp_path / "out.usda"))
+    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (1001, 1010)
+    assert stage.GetFramesPerSecond() == 30
+    (instancer,) = [p for p in stage.Traverse() if p.IsA(UsdGeom.PointInstancer)]
+    positions = np.array(UsdGeom.PointInstancer(instancer).GetPositionsAttr().Get(1004))
+    ply = PlyData.read(str(tmp_path / "ply" / "avatar.1004.ply"))["vertex"]
+    assert len(positions) == facts["gaussians"]
+    assert np.allclose(positions, np.stack([ply["x"], ply["y"], ply["z"]], -1), atol=1e-6)
+    assert sorted(path.name for path in (tmp_path / "ply").iterdir())[-1] == "avatar.1010.ply"
+
+
+def test_render_writes_sequences_per_camera(trained, tmp_path):
+    import OpenEXR
+
+    command(
+        *(
+            "render",
+            trained,
+            "--exr",
+            tmp_path / "exr",
+            "--png",
+            tmp_path / "png",
+            "--mp4",
+            tmp_path / "out.mp4",
+        ),
+        *("--frames", "1001-1005x2", "--res", "96", "128"),
+    )
+    for camera in ("cam0", "cam3"):
+        names = sorted(path.name for path in (tmp_path / "exr" / camera).iterdir())
+        assert names == [f"avatar.{camera}.{frame}.exr" for frame in (1001, 1003, 1005)]
+    with OpenEXR.File(str(tmp_path / "exr" / "cam0" / "avatar.cam0.1003.exr")) as file:
+        rgba = file.channels()["RGBA"].pixels
+    png = np.asarray(Image.open(tmp_path / "png" / "cam0" / "avatar.cam0.1003.png")) / 255
+    assert png.shape == rgba.shape == (128, 96, 4)
+    assert np.abs(png[..., 3] - rgba[..., 3]).max() < 0.01
+    assert (tmp_path / "out.mp4").stat().st_size > 1000
+
+
+def test_a_motion_file_drives_the_avatar_as_the_capture_does(trained, tiny_capture, tmp_path):
+    from plyfile import PlyData
+
+    motion = open_capture(tiny_capture).motions["bend"]
+    write_motion(tmp_path / "m.npz", motion, load_body())
+    command("export", trained, "--motion", tmp_path / "m.npz", "--ply", tmp_path / "a")
+    command("export", trained, "--motion", "bend", "--ply", tmp_path / "b")
+    a, b = (PlyData.read(str(tmp_path / x / "avatar.1008.ply"))["vertex"]["x"] for x in "ab")
+    assert np.allclose(a, b, atol=1e-4)
+
+
+def test_eval_reports_what_the_contract_names(trained, tmp_path):
+    command("eval", trained, "--json", tmp_path / "eval.json")
+    figures = json.loads((tmp_path / "eval.json").read_text())
+    assert set(figures["splits"]) == {"train", "test", "nd", "fd"}
+    test = figures["splits"]["test"]
+    assert test["psnr"] > test["psnr_box"] > 8
+    assert test["views"] == 4
+    assert test["lpips"] is None
+    assert figures["one_to_many"] is None
+    assert figures["gaussians"] > 400
+    assert figures["fps"] > 0
+
+
+def test_mistakes_are_one_line_and_exit_two(trained, tmp_path, capsys):
+    assert "--usd" in failure(capsys, "export", trained)
+    assert "cam0" in failure(capsys, "render", trained, "--png", tmp_path, "--camera", "cam9")
+    assert "nowhere.npz" in failure(capsys, "export", trained, "--ply", tmp_path, "--motion", "nowhere.npz")
+    assert "1001-1010" in failure(capsys, "export", trained, "--ply", tmp_path, "--frames", "2000")
+    assert "checkpoint" in failure(capsys, "export", tmp_path, "--ply", tmp_path)
+    assert "cpu" in failure(capsys, "eval", trained, "--device", "cuda").lower()
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_python_interface_says_the_same(trained, tiny_capture):
+    import dsar
+
+    capture = dsar.open_capture(tiny_capture)
+    sequence = dsar.roll_out(dsar.load(trained), capture.motions["bend"])
+    frame, gaussians = next(iter(sequence))
+    image = dsar.rasterize(gaussians, capture.cameras[0])
+    assert frame == 1001
+    assert image.color.shape == (64, 48, 3)
+    assert torch.isfinite(image.color).all()
+
+
+def test_help_of_every_command_names_its_flags():
+    for name, flag in (
+        ("train", "--model.window"),
+        ("export", "--usd"),
+        ("render", "--exr"),
+        ("eval", "--json"),
+    ):
+        shown = subprocess.run(
+            [sys.executable, "-m", "dsar", name, "--help"], capture_output=True, text=True, check=True
+        )
+        assert flag in shown.stdout
