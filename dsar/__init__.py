@@ -3,8 +3,12 @@
 Everything is imported on first use: `import dsar` alone is cheap.
 """
 
+import os
 from importlib import import_module
 from typing import Any
+
+# Idle OpenMP threads that spin take the cores from the rasteriser's; torch reads this when it is first imported.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 _PUBLIC = {
     "open_capture": "dsar.data.capture",

@@ -21,7 +21,7 @@ class AtlasConfig:
     """Side of the body's UV square in texels."""
     garment: Literal["auto", "off"] = "auto"
     """`auto` adds a chart fitted to the visual hull where cloth stands off the body (extension)."""
-    garment_rows: int = 48
+    garment_rows: int = 32
     """Height of the garment chart in texels; its width is `resolution`."""
     weight_smoothing: float = 0.12
     """Standard deviation in metres of the kernel that smooths the garment chart's skin weights."""

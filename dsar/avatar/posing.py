@@ -5,16 +5,14 @@ covariances and the harmonics, in rendering and in every export alike. Neither d
 that is learnt, so the rotation needs no gradient and is computed by a compiled kernel.
 """
 
-from typing import no_type_check
-
 import numpy as np
 import torch
 from jaxtyping import Float
-from numba import njit
 from torch import Tensor
 
 from dsar.geometry.harmonics import rotate_harmonics
 from dsar.geometry.rotations import quaternion_multiply
+from dsar.raster.jit import kernel
 from dsar.types import Gaussians
 
 _POLAR_STEPS = 6
@@ -49,8 +47,7 @@ def nearest_quaternions(matrices: Float[Tensor, "b n 3 3"]) -> Float[Tensor, "b 
     return torch.from_numpy(quaternions).to(matrices).reshape(*matrices.shape[:-2], 4)
 
 
-@njit(cache=True, nogil=True)
-@no_type_check  # a compiled function cannot be wrapped by the tests' run-time shape checks
+@kernel
 def _nearest_quaternions(matrices):
     """Polar factor by Newton's iteration R <- (R + R^-T) / 2 (Higham 1986), then Shepperd's quaternion."""
     count = matrices.shape[0]

@@ -1,0 +1,1 @@
+"""Captures and motions: one reader per format behind `dsar.types.Capture` and `dsar.types.Motion`."""

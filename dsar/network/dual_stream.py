@@ -153,6 +153,8 @@ def repeat_where(
     fresh: Bool[Tensor, " b"], newest: Float[Tensor, "b *s"], ring: Float[Tensor, "b n *s"]
 ) -> Float[Tensor, "b n *s"]:
     """Return the ring, or copies of the newest entry for rollouts that have no history yet."""
+    if not fresh.any():
+        return ring
     mask = fresh.reshape(-1, *[1] * (ring.ndim - 1))
     return torch.where(mask, newest[:, None], ring)
 

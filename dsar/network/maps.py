@@ -48,14 +48,14 @@ def maps_from_points(
     """
     ground = roots * roots.new_tensor([1.0, 0.0, 1.0])
     rate = fps / FPS
-    position = torch.einsum("bpi,bij->bpj", points[:, 0] - ground[:, None], headings)
+    position = (points[:, 0] - ground[:, None]) @ headings
     now = limit_norm((points[:, 0] - points[:, 1]) * rate, SPEED_LIMIT)
     before = limit_norm((points[:, 1] - points[:, 2]) * rate, SPEED_LIMIT)
     channels = [position]
     if velocity:
-        channels.append(torch.einsum("bpi,bij->bpj", now, headings))
+        channels.append(now @ headings)
     if acceleration:
-        channels.append(torch.einsum("bpi,bij->bpj", (now - before) * rate, headings))
+        channels.append(((now - before) * rate) @ headings)
     values = torch.cat([*channels, now.norm(dim=-1, keepdim=True)], -1)
     grid = values.new_zeros(len(values), values.shape[-1], size[0] * size[1])
     grid[:, :, cells] = values.transpose(1, 2)

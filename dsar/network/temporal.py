@@ -81,4 +81,4 @@ class TemporalMixing(nn.Module):
 
     def forward(self, frames: Float[Tensor, "b n c h w"]) -> Float[Tensor, "b c h w"]:
         """Return the mixture of n frames, oldest first."""
-        return self.mix(torch.einsum("bnchw,nc->bchw", frames, self.weights))
+        return self.mix((frames * self.weights[:, :, None, None]).sum(1))

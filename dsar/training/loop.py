@@ -133,7 +133,8 @@ def _train(config: TrainConfig, folder: Path, resume: bool, report: Reporter | N
             gradients.clear()
             done = _segment(trainer, rng, now, still, step)
             stop, used = gradients.average(bool(received), _used(config, began))
-            check_gradients(avatar, step)
+            if not gradients.buffer.isfinite().all():
+                raise TrainingError(f"step {step}: the gradient of {bad_gradient(avatar)} is not finite")
             nn.utils.clip_grad_norm_(avatar.network.parameters(), config.schedule.clip)
             optimizer.step()
             step += 1
@@ -217,11 +218,10 @@ def set_rates(optimizer: torch.optim.Optimizer, now: Position) -> None:
         group["lr"] = now.network_rate if name == "network" else _TEMPLATE_RATES[name] * now.template_factor
 
 
-def check_gradients(avatar: Avatar, step: int) -> None:
-    """Raise TrainingError naming the first parameter whose gradient is not finite."""
-    for name, parameter in avatar.named_parameters():
-        if parameter.grad is not None and not parameter.grad.isfinite().all():
-            raise TrainingError(f"step {step}: the gradient of {name} is not finite")
+def bad_gradient(avatar: Avatar) -> str:
+    """Return the name of the first parameter whose gradient is not finite."""
+    named = avatar.named_parameters()
+    return next(name for name, p in named if p.grad is not None and not p.grad.isfinite().all())
 
 
 def save(

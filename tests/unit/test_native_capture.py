@@ -241,5 +241,5 @@ def test_embedded_garment_projects_into_the_masks(embedded):
             alpha = embedded.image("far", frame, index)[..., 3]
             pixels, _ = project(camera, cloth[frame])
             column, row = pixels.floor().long().T.numpy()
-            # Half-millimetre truth against masks of 8 mm pixels: the hem may round over an edge.
+            # Millimetre truth against masks of 8 mm pixels: the hem may round over an edge.
             assert (alpha[row, column] > 0).mean() > 0.98

@@ -20,11 +20,11 @@ from dsar.body.model import Body
 from dsar.data.motion import write_motion
 from dsar.types import Camera
 
-QUALITY = 80
+QUALITY = 77
 """Of the lossy WebP colours; the mask in the alpha channel stays exact."""
 DECIMATION = 2
-GARMENT_UNIT = 0.0005
-"""Garment vertices are stored in half millimetres."""
+GARMENT_UNIT = 0.001
+"""Garment vertices are stored in whole millimetres."""
 
 
 def write_capture(
@@ -89,6 +89,9 @@ def _describe_take(name: str, take: Take) -> dict[str, object]:
 
 
 def _zip_images(path: Path, folder: Path, cameras: Sequence[Camera], frames: int) -> None:
+    """Write the images of one sequence as an archive, unless it is there."""
+    if path.exists():
+        return
     temporary = path.with_suffix(".tmp")
     with zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
         for camera in cameras:
