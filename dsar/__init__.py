@@ -7,7 +7,7 @@ import os
 from importlib import import_module
 from typing import Any
 
-# Idle OpenMP threads that spin take the cores from the rasteriser's; torch reads this when it is first imported.
+# Idle OpenMP threads that spin take the cores from the rasteriser's; torch reads this at its first import.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 _PUBLIC = {

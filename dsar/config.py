@@ -34,6 +34,9 @@ class ModelConfig:
     wiring: Literal["shared", "perframe"] = "perframe"
     """`shared` feeds the previous offset to every frame of the window (the paper: n encodings a step);
     `perframe` gives each frame the offset that preceded it (one encoding a step)."""
+    axes: Literal["body", "surface"] = "surface"
+    """Axes of offsets, velocities and accelerations: `body` is canonical and heading axes (the paper);
+    `surface` is each texel's own side, up and normal, so that a flare is the same number all around."""
     window: int = 5
     """Frames n that the network sees, the current one included."""
     memory: int = 6
@@ -58,6 +61,9 @@ class ModelConfig:
     """Initial lambda: the share of the memory in the hidden state."""
     offset_scale: float = 0.3
     """Metres of offset for a unit output."""
+    appearance_scale: float = 0.1
+    """Factor on the residuals of rotation, scale, opacity and colour: below 1 the geometry learns first,
+    before colours can settle for a blur (1: the paper's)."""
     offset_limit: float = 0.5
     """Metres beyond which a loose tanh holds the offset."""
     sh_degree: int = 0
@@ -126,7 +132,7 @@ class ScheduleConfig:
     """Peak rate of the network; cosine to 2 % of it."""
     warmup: int = 50
     """Updates of linear warm-up of the network's rate."""
-    template_rate: float = 0.1
+    template_rate: float = 0.02
     """Factor on the template's rates once the network trains."""
     clip: float = 1.0
     """Largest norm of the network's gradient."""
@@ -194,6 +200,7 @@ PRESETS: dict[str, TrainConfig] = {
         atlas=AtlasConfig(resolution=512, garment="off", weight_smoothing=0.0),
         model=ModelConfig(
             wiring="shared",
+            axes="body",
             window=10,
             memory=10,
             acceleration=False,
@@ -202,6 +209,7 @@ PRESETS: dict[str, TrainConfig] = {
             upsample=1,
             identity_channels=0,
             recall=0.1,
+            appearance_scale=1.0,
         ),
         loss=LossConfig(pyramid=1, ssim=0.2, lpips=0.5, alpha=0.0, temporal_scale=1.0),
         schedule=ScheduleConfig(steps=300_000, learning_rate=6e-4, half_resolution_share=0.0, streams=1),

@@ -33,6 +33,8 @@ class Avatar(nn.Module):
     cells: Tensor
     control_points: Tensor
     control_weights: Tensor
+    control_frames: Tensor
+    texel_frames: Tensor
     map_mean: Tensor
     map_scale: Tensor
     speed_scale: Tensor
@@ -49,12 +51,14 @@ class Avatar(nn.Module):
         self.register_buffer("texels", atlas.texels)
         self.register_buffer("texel_positions", atlas.positions)
         self.register_buffer("texel_weights", atlas.weights)
+        self.register_buffer("texel_frames", atlas.frames)
         size = (atlas.height // model.upsample, atlas.width // model.upsample)
         cells, nearest = grid_cells(atlas, model.upsample)
         self.grid_size = size
         self.register_buffer("cells", cells)
         self.register_buffer("control_points", atlas.positions[nearest])
         self.register_buffer("control_weights", atlas.weights[nearest])
+        self.register_buffer("control_frames", atlas.frames[nearest])
         self.register_buffer("row_mix", interpolation_matrix(size[0], atlas.height), persistent=False)
         self.register_buffer("column_mix", interpolation_matrix(size[1], atlas.width), persistent=False)
         self.register_buffer("map_mean", torch.zeros(model.map_channels, 1, 1))
@@ -107,9 +111,15 @@ class Avatar(nn.Module):
         points = (blended[..., :3] * self.control_points[:, None, :]).sum(-1) + blended[..., 3]
         pelvis = context[:, 0, 0]
         roots = pelvis[:, :3, :3] @ self.body_joints[0] + pelvis[:, :3, 3]
+        headings = heading_matrix(pelvis[:, :3, :3])
+        if self.model.axes == "surface":
+            axes = blended[:, 0, :, :, :3] @ self.control_frames
+        else:
+            axes = headings[:, None].expand(-1, len(self.cells), -1, -1)
         return maps_from_points(
             points,
-            heading_matrix(pelvis[:, :3, :3]),
+            headings,
+            axes,
             roots,
             self.cells,
             self.grid_size,
@@ -148,9 +158,26 @@ class Avatar(nn.Module):
         if output is None:
             canonical = self.template.activate()
         else:
-            offset, appearance = self.at_texels(output.offset), self.at_texels(output.appearance)
-            canonical = self.template.activate(offset, appearance)
+            offset = self.canonical(self.at_texels(output.offset), self.texel_frames)
+            canonical = self.template.activate(offset, self.at_texels(output.appearance))
         return pose_gaussians(canonical, blend(self.texel_weights, context[:, :1])[:, 0])
+
+    def canonical(
+        self, offset: Float[Tensor, "b n 3"], frames: Float[Tensor, "n 3 3"]
+    ) -> Float[Tensor, "b n 3"]:
+        """Return offsets in the canonical frame from components along the configured axes."""
+        if self.model.axes == "body":
+            return offset
+        return (frames * offset[..., None, :]).sum(-1)
+
+    def deformed_control_points(
+        self, context: Float[Tensor, "b 3 j 4 4"], output: NetworkOutput
+    ) -> Float[Tensor, "b p 3"]:
+        """Return the newest frame's control points, offset and posed, world metres."""
+        offset = output.offset.flatten(2)[:, :, self.cells].transpose(1, 2)
+        points = self.control_points + self.canonical(offset, self.control_frames)
+        blended = blend(self.control_weights, context[:, :1])[:, 0]
+        return (blended[..., :3] * points[..., None, :]).sum(-1) + blended[..., 3]
 
     def step(
         self, context: Float[Tensor, "b 3 j 4 4"], state: NetworkState

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from dsar.body.atlas import Chart
+from dsar.body.atlas import Chart, surface_frames
 from dsar.body.model import JOINT_NAMES, Body
 from dsar.geometry.cameras import project
 from dsar.types import Capture
@@ -62,7 +62,9 @@ def fit_garment_chart(
     LOGGER.info(
         "loose garment found: %.2f m from waist to hem, mean hem radius %.2f m", waist - hem, radii[-1].mean()
     )
-    return Chart(torch.ones(size, dtype=torch.bool), positions, diffuse_weights(body, positions, smoothing))
+    weights = diffuse_weights(body, positions, smoothing)
+    frames = surface_frames(directions.repeat(size[0], 1))
+    return Chart(torch.ones(size, dtype=torch.bool), positions, weights, frames)
 
 
 def hull_radii(

@@ -25,6 +25,8 @@ class Chart:
     """Rest positions of the covered texels in row-major order, metres."""
     weights: Float[Tensor, "n j"]
     """Skin weights of the covered texels; rows sum to 1."""
+    frames: Float[Tensor, "n 3 3"]
+    """Rest axes of the surface at each texel, as columns: side, up along the surface, outward normal."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,8 @@ class Atlas:
     """Rest position of each texel, metres."""
     weights: Float[Tensor, "n j"]
     """Skin weights of each texel."""
+    frames: Float[Tensor, "n 3 3"]
+    """Rest axes of the surface at each texel (see `Chart`)."""
 
     def __len__(self) -> int:
         """Return the number of Gaussians."""
@@ -56,6 +60,7 @@ class Atlas:
             texels=covered.flatten().nonzero().squeeze(1),
             positions=torch.cat([chart.positions for chart in charts]),
             weights=torch.cat([chart.weights for chart in charts]),
+            frames=torch.cat([chart.frames for chart in charts]),
         )
 
 
@@ -82,7 +87,27 @@ def body_chart(body: Body, resolution: int, smoothing_rounds: int = 0) -> Chart:
         covered=covered,
         positions=torch.einsum("nk,nkc->nc", mix, body.vertices[corners]),
         weights=torch.einsum("nk,nkj->nj", mix, weights[corners]),
+        frames=surface_frames(torch.einsum("nk,nkc->nc", mix, vertex_normals(body)[corners])),
     )
+
+
+def vertex_normals(body: Body) -> Float[Tensor, "v 3"]:
+    """Return outward unit normals of the resting body, faces weighted by area."""
+    a, b, c = body.vertices[body.faces].unbind(1)
+    normals = torch.linalg.cross(b - a, c - a)
+    summed = torch.zeros_like(body.vertices)
+    for corner in range(3):
+        summed.index_add_(0, body.faces[:, corner], normals)
+    return torch.nn.functional.normalize(summed, dim=-1)
+
+
+def surface_frames(normals: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3 3"]:
+    """Return right-handed axes (columns side, up, normal); where the surface is level, up is the front."""
+    normals = torch.nn.functional.normalize(normals, dim=-1)
+    level = normals[:, 1:2].abs() > 0.95
+    up = torch.where(level, normals.new_tensor([0.0, 0.0, 1.0]), normals.new_tensor([0.0, 1.0, 0.0]))
+    up = torch.nn.functional.normalize(up - (up * normals).sum(-1, keepdim=True) * normals, dim=-1)
+    return torch.stack([torch.linalg.cross(up, normals), up, normals], -1)
 
 
 def rasterize_uv(body: Body, resolution: int) -> tuple[Int64[Tensor, "r r"], Float[Tensor, "r r 3"]]:

@@ -21,9 +21,9 @@ class NetworkOutput:
     """One step's residual maps, and the features that the temporal losses compare."""
 
     offset: Float[Tensor, "b 3 h w"]
-    """Displacement of the Gaussians in the canonical frame, metres."""
+    """Displacement of the Gaussians at rest along the configured axes, metres."""
     appearance: Float[Tensor, "b a h w"]
-    """Raw residuals: quaternion 4, log-scale 3, opacity logit 1, harmonics 3k."""
+    """Residuals of raw values: quaternion 4, log-scale 3, opacity logit 1, harmonics 3k."""
     features: tuple[Float[Tensor, "b _ _ _"], ...]
     """The aggregated hierarchy F, finest level first."""
 
@@ -116,7 +116,8 @@ class DualStreamNetwork(nn.Module):
             offset=offset,
             memory=memory,
         )
-        return NetworkOutput(offset, raw[:, 3:], tuple(features)), next_state
+        appearance = self.config.appearance_scale * raw[:, 3:]
+        return NetworkOutput(offset, appearance, tuple(features)), next_state
 
     def _bounded(self, raw: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
         """Scale raw offsets to metres; a loose tanh guards long rollouts and costs nothing inside it."""

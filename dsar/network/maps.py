@@ -17,7 +17,7 @@ class FrameMaps:
     """The input maps of a batch of frames on the network's grid, metres and reference frames."""
 
     maps: Float[Tensor, "b c h w"]
-    """Position, velocity, acceleration, in the frame's own heading frame, not yet standardised."""
+    """Position in the heading frame, velocity and acceleration along the given axes; not standardised."""
     speed: Float[Tensor, "b 1 h w"]
     """Motion magnitude V, metres per 1/30 s."""
 
@@ -28,9 +28,15 @@ def limit_norm(vectors: Float[Tensor, "*b 3"], limit: float) -> Float[Tensor, "*
     return vectors * (limit / norm.clamp_min(limit))
 
 
+def _resolve(vectors: Float[Tensor, "b p 3"], axes: Float[Tensor, "b p 3 3"]) -> Float[Tensor, "b p 3"]:
+    """Return the components of world vectors along axes given as columns."""
+    return (vectors[..., :, None] * axes).sum(-2)
+
+
 def maps_from_points(
     points: Float[Tensor, "b 3 p 3"],
     headings: Float[Tensor, "b 3 3"],
+    axes: Float[Tensor, "b p 3 3"],
     roots: Float[Tensor, "b 3"],
     cells: Int64[Tensor, " p"],
     size: tuple[int, int],
@@ -43,8 +49,9 @@ def maps_from_points(
 
     `points[:, 0]` is the newest frame, in world metres. Positions are relative to the root on the
     ground plane and turned by the inverse heading; gravity's direction and the height stay.
-    Velocities are true world velocities in that frame, so a spin or a walk remains visible. They are
-    cut at SPEED_LIMIT. `cells` are flat grid indices of the points; other cells are zero.
+    Velocities are true world velocities, so a spin or a walk remains visible, resolved along `axes`
+    (columns, world) and cut at SPEED_LIMIT. `cells` are flat grid indices of the points; other cells are
+    zero.
     """
     ground = roots * roots.new_tensor([1.0, 0.0, 1.0])
     rate = fps / FPS
@@ -53,9 +60,9 @@ def maps_from_points(
     before = limit_norm((points[:, 1] - points[:, 2]) * rate, SPEED_LIMIT)
     channels = [position]
     if velocity:
-        channels.append(now @ headings)
+        channels.append(_resolve(now, axes))
     if acceleration:
-        channels.append(((now - before) * rate) @ headings)
+        channels.append(_resolve((now - before) * rate, axes))
     values = torch.cat([*channels, now.norm(dim=-1, keepdim=True)], -1)
     grid = values.new_zeros(len(values), values.shape[-1], size[0] * size[1])
     grid[:, :, cells] = values.transpose(1, 2)

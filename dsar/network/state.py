@@ -24,7 +24,7 @@ class NetworkState:
     motion: Float[Tensor, "b n c hL wL"]
     """Embedded motion magnitudes m of the last n frames at the coarsest level, oldest first."""
     offset: Float[Tensor, "b 3 h w"]
-    """Geometric stream: the previous frame's offset map, canonical metres."""
+    """Geometric stream: the previous frame's offset map, metres."""
     memory: Float[Tensor, "b m c hL wL"]
     """State stream: the bank of the last m hidden states h, oldest first."""
 

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from dsar.avatar.avatar import Avatar, blend, contexts
+from dsar.avatar.avatar import Avatar, contexts
 from dsar.config import TrainConfig
 from dsar.errors import TrainingError
 from dsar.network import NetworkOutput, NetworkState
@@ -134,9 +134,7 @@ class SegmentTrainer:
     ) -> Tensor:
         """Append this frame's record and return the temporal losses against the frames before it."""
         avatar = self.avatar
-        blended = blend(avatar.control_weights, context[:, :1])[:, 0]
-        deformed = avatar.control_points + output.offset.flatten(2)[:, :, avatar.cells].transpose(1, 2)
-        posed = (blended[..., :3] * deformed[..., None, :]).sum(-1) + blended[..., 3]
+        posed = avatar.deformed_control_points(context, output)
         self.records.append(TemporalRecord(output, posed, observed.speed))
         ages = [place.age for place in places]
         return temporal_loss(

@@ -7,11 +7,11 @@ import sys
 import numpy as np
 import pytest
 import torch
-from dsar.data.capture import open_capture
 from PIL import Image
 
 from dsar.body.files import load_body
 from dsar.cli import main
+from dsar.data.capture import open_capture
 from dsar.data.motion import write_motion
 
 

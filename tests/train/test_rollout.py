@@ -16,11 +16,12 @@ from dsar.geometry.rotations import matrix_from_axis_angle, matrix_from_quaterni
 from dsar.types import Motion
 
 
-@pytest.fixture(scope="module", params=["perframe", "shared"])
+@pytest.fixture(scope="module", params=[("perframe", "surface"), ("shared", "body")], ids="-".join)
 def avatar(request):
     torch.manual_seed(0)
     body = load_body()
-    config = ModelConfig(wiring=request.param, channels=(8, 16), heads=2, window=4, memory=3, sh_degree=1)
+    wiring, axes = request.param
+    config = ModelConfig(wiring=wiring, axes=axes, channels=(8, 16), heads=2, window=4, memory=3, sh_degree=1)
     made = Avatar(body, Atlas.stack([body_chart(body, 32)]), config, 30.0)
     torch.nn.init.normal_(made.network.decoder.head.weight, std=0.2)
     torch.nn.init.normal_(made.template.harmonics, std=0.2)

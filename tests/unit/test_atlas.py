@@ -66,3 +66,14 @@ def test_interpolation_by_matrices_is_bilinear_interpolation():
     rows, columns = interpolation_matrix(6, 24), interpolation_matrix(4, 16)
     expected = torch.nn.functional.interpolate(maps, size=(24, 16), mode="bilinear")
     assert torch.allclose(rows @ maps @ columns.mT, expected, atol=1e-6)
+
+
+def test_surface_frames_are_right_handed_and_point_outwards_and_up(body):
+    chart = body_chart(body, 64)
+    identity = torch.eye(3).expand(len(chart.frames), 3, 3)
+    assert torch.allclose(chart.frames.mT @ chart.frames, identity, atol=1e-5)
+    assert torch.allclose(torch.linalg.det(chart.frames), torch.ones(len(chart.frames)), atol=1e-5)
+    normals, up = chart.frames[..., 2], chart.frames[..., 1]
+    assert (up[normals[:, 1].abs() < 0.9, 1] > 0.4).all()
+    chest = (chart.positions - torch.tensor([0.0, 0.45, 0.15])).norm(dim=1).argmin()
+    assert normals[chest, 2] > 0.7

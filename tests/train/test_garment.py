@@ -1,0 +1,90 @@
+"""The garment chart on the embedded capture: found, in place, and able to carry what the images show."""
+
+import numpy as np
+import pytest
+import torch
+
+from dsar.avatar.avatar import Avatar, contexts
+from dsar.avatar.garment import loose_extent
+from dsar.config import AtlasConfig, TrainConfig
+from dsar.data.capture import open_capture
+from dsar.raster import rasterize
+from dsar.training import loop
+from dsar.training.segment import SegmentTrainer
+from dsar.training.stages import Position
+from dsar.training.workers import Gradients
+
+
+@pytest.fixture(scope="module")
+def capture():
+    return open_capture()
+
+
+@pytest.fixture(scope="module")
+def avatar(capture):
+    torch.manual_seed(0)
+    config = TrainConfig()
+    return Avatar.from_capture(capture, capture.body, config.atlas, config.model)
+
+
+def test_the_chart_spans_the_true_skirt_at_rest(capture, avatar):
+    columns = AtlasConfig().resolution
+    chart = avatar.template.means.detach()[-columns * AtlasConfig().garment_rows :]
+    pelvis = avatar.track(capture.motions["sway"])[0, 0]
+    world = (chart @ pelvis[:3, :3].T + pelvis[:3, 3]).numpy()
+    truth = capture.garment("sway")[0]
+    assert abs(world[:, 1].min() - truth[:, 1].min()) < 0.04
+    # The hull cannot see where the skirt leaves the body: the waist may be a little low or high.
+    assert abs(world[:, 1].max() - truth[:, 1].max()) < 0.12
+    nearest = np.linalg.norm(truth[:, None] - world[None], axis=-1).min(1)
+    assert np.median(nearest) < 0.03
+
+
+def test_a_tight_figure_gets_no_chart():
+    heights = torch.linspace(-0.7, 0.3, 81)
+    assert loose_extent(heights, torch.full((81,), 0.02)) is None
+    skirt = torch.where((heights > -0.3) & (heights < 0.1), 0.1, 0.0)
+    hem, waist = loose_extent(heights, skirt)
+    assert hem == pytest.approx(-0.3, abs=0.02)
+    assert waist == pytest.approx(0.1, abs=0.02)
+
+
+@pytest.mark.parametrize(("sequence", "frame"), [("spin_left", 0), ("spin_left", 45)], ids=["rest", "spin"])
+def test_one_fitted_frame_covers_the_mask(capture, sequence, frame):
+    """Alpha recall inside the mask, the measure of a garment that this avatar can carry."""
+    torch.manual_seed(0)
+    config = TrainConfig()
+    avatar = Avatar.from_capture(capture, capture.body, config.atlas, config.model).train()
+    trainer = SegmentTrainer(config, capture, avatar, {sequence: range(frame + 1)}, None)
+    optimizer, gradients = loop.make_optimizer(avatar), Gradients(list(avatar.parameters()))
+    for step in range(90):
+        reduction, factor = (2, 1.0) if step < 60 else (1, 0.5)
+        loop.set_rates(optimizer, Position("template", 1, reduction, 0.0, factor))
+        gradients.clear()
+        trainer.template_segment(np.random.default_rng(step), [(sequence, frame)], reduction)
+        optimizer.step()
+    recall = []
+    with torch.no_grad():
+        gaussians = avatar.gaussians(contexts(trainer.tracks[sequence], torch.tensor([frame])), None)[0]
+        for index, camera in enumerate(capture.cameras):
+            mask = capture.image(sequence, frame, index)[..., 3] > 127
+            recall.append(float(rasterize(gaussians, camera).alpha[torch.from_numpy(mask)].mean()))
+    assert np.mean(recall) >= 0.98
+
+
+def test_the_embedded_capture_is_what_a_test_of_memory_needs(capture):
+    """One pose with two pasts: the cloth differs by more than 5 cm, and the body by nothing."""
+    (pair,) = capture.one_to_many
+    garment, motion = capture.garment(pair.sequence), capture.motions[pair.sequence]
+    rest = sum(pair.at_rest) // 2
+    after = range(pair.after_stop[0], pair.after_stop[1] + 1)
+    for frame in after:
+        assert torch.allclose(motion.rotations[frame], motion.rotations[rest], atol=1e-5)
+        assert torch.allclose(motion.translations[frame], motion.translations[rest], atol=1e-5)
+    apart = [np.sqrt(((garment[f] - garment[rest]) ** 2).sum(-1).mean()) for f in after]
+    assert np.mean(apart[:15]) > 0.05
+    # The floor: two true runs are far closer to each other than the held pose's two pasts.
+    floor = np.sqrt(((capture.garment(pair.sequence, 1) - garment) ** 2).sum(-1).mean())
+    assert floor < 0.3 * np.mean(apart[:15])
+    assert sum(len(capture.motions[name]) for name in capture.splits["train"]) >= 700
+    assert len(capture.splits["train"]) >= 6
