@@ -110,7 +110,7 @@ class LossConfig:
 class ScheduleConfig:
     """The three stages and the optimiser."""
 
-    steps: int = 3200
+    steps: int = 1500
     """Updates in all."""
     minutes: float | None = None
     """Wall-clock budget: the schedule is compressed to fit when the machine is too slow for `steps`."""
@@ -128,7 +128,7 @@ class ScheduleConfig:
     """Frames K of truncated back-propagation through time."""
     horizon: int = 16
     """Frames after which a rollout restarts when feedback begins; it grows to whole clips."""
-    learning_rate: float = 1e-3
+    learning_rate: float = 2e-3
     """Peak rate of the network; cosine to 2 % of it."""
     warmup: int = 50
     """Updates of linear warm-up of the network's rate."""
