@@ -129,7 +129,7 @@ class Avatar(nn.Module):
         )
 
     @torch.no_grad()
-    def measure_maps(self, tracks: list[Float[Tensor, "f j 4 4"]]) -> None:
+    def measure_maps(self, tracks: list[Float[Tensor, "_ j 4 4"]]) -> None:
         """Set the statistics that standardise input maps from training motions."""
         maps, speeds = [], []
         for track in tracks:

@@ -21,7 +21,7 @@ def restlessness(joints: Float[Tensor, "f j 3"], fps: float) -> Float[Tensor, " 
 
 
 def stillest_frames(
-    tracks: dict[str, Float32[Tensor, "f j 4 4"]], fps: float, count: int, per_sequence: int
+    tracks: dict[str, Float32[Tensor, "_ j 4 4"]], fps: float, count: int, per_sequence: int
 ) -> list[tuple[str, int]]:
     """Return the `count` stillest frames, at most `per_sequence` from any sequence.
 

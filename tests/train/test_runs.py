@@ -16,10 +16,17 @@ from dsar.training.checkpoint import Run, load_checkpoint
 from tests.conftest import train_arguments
 
 
-def run_command(*arguments, **options):
+def started(arguments) -> subprocess.Popen:
+    """Start `dsar` as a process of its own, warnings as errors."""
+    command = [sys.executable, "-m", "dsar", *arguments]
     environment = {**os.environ, "PYTHONWARNINGS": "error"}
-    command = [sys.executable, "-m", "dsar", *map(str, arguments)]
-    return subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True, **options)
+    return subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
+
+
+def finished(process: subprocess.Popen, code: int = 0) -> None:
+    """Wait for a process and check how it ended."""
+    _, message = process.communicate(timeout=240)
+    assert process.returncode == code, message
 
 
 def test_training_leaves_everything_the_contract_names_and_gets_better(trained):
@@ -35,17 +42,16 @@ def test_an_interrupted_run_resumes_to_the_same_bits(tiny_capture, tmp_path):
     """Two workers; SIGINT once training moves, then the same command with --resume."""
     whole, stopped = tmp_path / "whole", tmp_path / "stopped"
     command = ("--steps", "60", "--workers", "2", "--schedule.template-share", "0.1")
-    assert run_command(*train_arguments(tiny_capture, whole, *command)).wait(240) == 0
-    process = run_command(*train_arguments(tiny_capture, stopped, *command))
+    finished(started(train_arguments(tiny_capture, whole, *command)))
+    process = started(train_arguments(tiny_capture, stopped, *command))
     deadline = time.monotonic() + 120
     while not (stopped / "metrics.jsonl").exists() and time.monotonic() < deadline:
         time.sleep(0.01)
     process.send_signal(signal.SIGINT)
-    _, message = process.communicate(timeout=60)
-    assert process.returncode == 130, message
+    finished(process, 130)
     step = json.loads((stopped / "checkpoint" / "progress.json").read_text())["step"]
     assert 20 <= step < 60
-    assert run_command(*train_arguments(tiny_capture, stopped, *command, "--resume")).wait(240) == 0
+    finished(started(train_arguments(tiny_capture, stopped, *command, "--resume")))
     for name in ("avatar", "optimizer", "rollouts-0", "rollouts-1"):
         a, b = (load_file(folder / "checkpoint" / f"{name}.safetensors") for folder in (whole, stopped))
         assert a.keys() == b.keys()
