@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import minimum_filter
 
 from dsar.avatar.avatar import Avatar, contexts
 from dsar.avatar.garment import loose_extent
@@ -51,25 +52,33 @@ def test_a_tight_figure_gets_no_chart():
 
 @pytest.mark.parametrize(("sequence", "frame"), [("spin_left", 0), ("spin_left", 45)], ids=["rest", "spin"])
 def test_one_fitted_frame_covers_the_mask(capture, sequence, frame):
-    """Alpha recall inside the mask, the measure of a garment that this avatar can carry."""
+    """Alpha recall, the measure of a garment that this avatar can carry.
+
+    The solid inside of the mask must be covered; of the whole true alpha, soft border included, a little is
+    lost to the rasteriser's blur of 0.3 pixels.
+    """
     torch.manual_seed(0)
     config = TrainConfig()
     avatar = Avatar.from_capture(capture, capture.body, config.atlas, config.model).train()
     trainer = SegmentTrainer(config, capture, avatar, {sequence: range(frame + 1)}, None)
     optimizer, gradients = loop.make_optimizer(avatar), Gradients(list(avatar.parameters()))
-    for step in range(90):
-        reduction, factor = (2, 1.0) if step < 60 else (1, 0.5)
+    for step in range(110):
+        reduction, factor = (2, 1.0) if step < 50 else (1, 0.5)
         loop.set_rates(optimizer, Position("template", 1, reduction, 0.0, factor))
         gradients.clear()
         trainer.template_segment(np.random.default_rng(step), [(sequence, frame)], reduction)
         optimizer.step()
-    recall = []
+    solid_recall, soft_recall = [], []
     with torch.no_grad():
         gaussians = avatar.gaussians(contexts(trainer.tracks[sequence], torch.tensor([frame])), None)[0]
         for index, camera in enumerate(capture.cameras):
-            mask = capture.image(sequence, frame, index)[..., 3] > 127
-            recall.append(float(rasterize(gaussians, camera).alpha[torch.from_numpy(mask)].mean()))
-    assert np.mean(recall) >= 0.98
+            truth = torch.tensor(capture.image(sequence, frame, index)[..., 3]) / 255
+            alpha = rasterize(gaussians, camera).alpha
+            solid = torch.from_numpy(minimum_filter(truth.numpy(), 3) > 0.99)
+            solid_recall.append(float(alpha[solid].mean()))
+            soft_recall.append(float(torch.minimum(alpha, truth).sum() / truth.sum()))
+    assert np.mean(solid_recall) >= 0.99
+    assert np.mean(soft_recall) >= 0.97
 
 
 def test_the_embedded_capture_is_what_a_test_of_memory_needs(capture):
