@@ -63,8 +63,8 @@ def fit_garment_chart(
         "loose garment found: %.2f m from waist to hem, mean hem radius %.2f m", waist - hem, radii[-1].mean()
     )
     weights = diffuse_weights(body, positions, smoothing)
-    frames = surface_frames(directions.repeat(size[0], 1))
-    return Chart(torch.ones(size, dtype=torch.bool), positions, weights, frames)
+    axes = surface_frames(directions.repeat(size[0], 1))
+    return Chart(torch.ones(size, dtype=torch.bool), positions, weights, axes)
 
 
 def hull_radii(
