@@ -4,6 +4,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
+from dsar.avatar.fused import bilinear_taps, pose_fused, sample
 from dsar.avatar.garment import fit_garment_chart
 from dsar.avatar.posing import pose_gaussians
 from dsar.avatar.stillness import stillest_frames
@@ -34,13 +35,14 @@ class Avatar(nn.Module):
     control_points: Tensor
     control_weights: Tensor
     control_frames: Tensor
-    texel_frames: Tensor
+    texel_axes: Tensor
+    control_axes: Tensor
     map_mean: Tensor
     map_scale: Tensor
     speed_scale: Tensor
     body_joints: Tensor
-    row_mix: Tensor
-    column_mix: Tensor
+    tap_cells: Tensor
+    tap_weights: Tensor
 
     def __init__(self, body: Body, atlas: Atlas, model: ModelConfig, fps: float) -> None:
         super().__init__()
@@ -59,8 +61,13 @@ class Avatar(nn.Module):
         self.register_buffer("control_points", atlas.positions[nearest])
         self.register_buffer("control_weights", atlas.weights[nearest])
         self.register_buffer("control_frames", atlas.frames[nearest])
-        self.register_buffer("row_mix", interpolation_matrix(size[0], atlas.height), persistent=False)
-        self.register_buffer("column_mix", interpolation_matrix(size[1], atlas.width), persistent=False)
+        axes = atlas.frames if model.axes == "surface" else torch.eye(3).expand_as(atlas.frames)
+        self.register_buffer("texel_axes", axes.contiguous(), persistent=False)
+        self.register_buffer("control_axes", axes[nearest], persistent=False)
+        rows, columns = atlas.texels // atlas.width, atlas.texels % atlas.width
+        taps = bilinear_taps(rows, columns, model.upsample, size)
+        self.register_buffer("tap_cells", taps[0], persistent=False)
+        self.register_buffer("tap_weights", taps[1], persistent=False)
         self.register_buffer("map_mean", torch.zeros(model.map_channels, 1, 1))
         self.register_buffer("map_scale", torch.ones(model.map_channels, 1, 1))
         self.register_buffer("speed_scale", torch.ones(()))
@@ -155,27 +162,24 @@ class Avatar(nn.Module):
 
     def gaussians(self, context: Float[Tensor, "b 3 j 4 4"], output: NetworkOutput | None) -> list[Gaussians]:
         """Return the posed Gaussians of each batch entry; without an output, the template's."""
+        blended = blend(self.texel_weights, context[:, :1])[:, 0]
         if output is None:
-            canonical = self.template.activate()
+            shape = (len(context), 3 + self.model.appearance_channels, *self.grid_size)
+            offset, appearance = blended.new_zeros(shape).split([3, shape[1] - 3], 1)
         else:
-            offset = self.canonical(self.at_texels(output.offset), self.texel_frames)
-            canonical = self.template.activate(offset, self.at_texels(output.appearance))
-        return pose_gaussians(canonical, blend(self.texel_weights, context[:, :1])[:, 0])
-
-    def canonical(
-        self, offset: Float[Tensor, "b n 3"], frames: Float[Tensor, "n 3 3"]
-    ) -> Float[Tensor, "b n 3"]:
-        """Return offsets in the canonical frame from components along the configured axes."""
-        if self.model.axes == "body":
-            return offset
-        return (frames * offset[..., None, :]).sum(-1)
+            offset, appearance = output.offset, output.appearance
+        taps = (self.tap_cells, self.tap_weights)
+        if blended.dtype == torch.float32 and blended.device.type == "cpu":
+            return pose_fused(self.template, offset, appearance, taps, self.texel_axes, blended)
+        offsets = (self.texel_axes * sample(offset, taps)[..., None, :]).sum(-1)
+        return pose_gaussians(self.template.activate(offsets, sample(appearance, taps)), blended)
 
     def deformed_control_points(
         self, context: Float[Tensor, "b 3 j 4 4"], output: NetworkOutput
     ) -> Float[Tensor, "b p 3"]:
         """Return the newest frame's control points, offset and posed, world metres."""
         offset = output.offset.flatten(2)[:, :, self.cells].transpose(1, 2)
-        points = self.control_points + self.canonical(offset, self.control_frames)
+        points = self.control_points + (self.control_axes * offset[..., None, :]).sum(-1)
         blended = blend(self.control_weights, context[:, :1])[:, 0]
         return (blended[..., :3] * points[..., None, :]).sum(-1) + blended[..., 3]
 
@@ -185,13 +189,6 @@ class Avatar(nn.Module):
         """Advance rollouts by one frame: posed Gaussians of each, and the state to carry on."""
         output, state, _ = self.advance(context, state)
         return self.gaussians(context, output), state
-
-    def at_texels(self, maps: Float[Tensor, "b c h w"]) -> Float[Tensor, "b n c"]:
-        """Return map values at every Gaussian's texel, bilinear between the network's pixels."""
-        if self.model.upsample > 1:
-            # Two matrix products, which on a CPU cost a third of interpolate's forward and backward.
-            maps = self.row_mix @ maps @ self.column_mix.mT
-        return maps.flatten(2)[:, :, self.texels].transpose(1, 2)
 
 
 def blend(
@@ -205,12 +202,6 @@ def contexts(track: Float[Tensor, "f j 4 4"], frames: Int64[Tensor, " b"]) -> Fl
     """Return frames with their two predecessors, newest first; the first frame precedes itself."""
     index = (frames[:, None] - torch.arange(3)).clamp_min(0)
     return track[index]
-
-
-def interpolation_matrix(coarse: int, fine: int) -> Float[Tensor, "fine coarse"]:
-    """Return the linear map from a line of coarse pixels to fine ones, bilinear between pixel centres."""
-    lines = torch.eye(coarse)[None]
-    return nn.functional.interpolate(lines, size=fine, mode="linear")[0].mT.contiguous()
 
 
 def grid_cells(atlas: Atlas, upsample: int) -> tuple[Int64[Tensor, " p"], Int64[Tensor, " p"]]:

@@ -5,7 +5,8 @@ import dataclasses
 import pytest
 import torch
 
-from dsar.avatar.avatar import grid_cells, interpolation_matrix
+from dsar.avatar.avatar import grid_cells
+from dsar.avatar.fused import bilinear_taps, sample
 from dsar.body.atlas import Atlas, body_chart, rasterize_uv, smooth_weights
 from dsar.body.files import load_body
 from dsar.errors import BodyError
@@ -61,11 +62,14 @@ def test_every_occupied_cell_holds_a_texel_of_its_own(body):
     assert set((atlas.texels // 64 // 4 * 16 + atlas.texels % 64 // 4).tolist()) == set(cells.tolist())
 
 
-def test_interpolation_by_matrices_is_bilinear_interpolation():
+def test_taps_sample_maps_as_bilinear_interpolation_does():
     maps = torch.randn(2, 3, 6, 4, generator=torch.Generator().manual_seed(0))
-    rows, columns = interpolation_matrix(6, 24), interpolation_matrix(4, 16)
+    rows, columns = (
+        grid.flatten() for grid in torch.meshgrid(torch.arange(24), torch.arange(16), indexing="ij")
+    )
     expected = torch.nn.functional.interpolate(maps, size=(24, 16), mode="bilinear")
-    assert torch.allclose(rows @ maps @ columns.mT, expected, atol=1e-6)
+    sampled = sample(maps, bilinear_taps(rows, columns, 4, (6, 4)))
+    assert torch.allclose(sampled.mT.reshape(2, 3, 24, 16), expected, atol=1e-6)
 
 
 def test_surface_frames_are_right_handed_and_point_outwards_and_up(body):

@@ -1,7 +1,9 @@
 """Posing: rotations that are rotations, and Gaussians that move as rigidly as the bones."""
 
+import pytest
 import torch
 
+from dsar.avatar.fused import bilinear_taps, pose_fused, sample
 from dsar.avatar.posing import nearest_quaternions, pose_gaussians
 from dsar.avatar.template import GaussianParameters
 from dsar.geometry.rotations import matrix_from_axis_angle, matrix_from_quaternion, nearest_rotation
@@ -40,3 +42,39 @@ def test_a_rigid_move_carries_means_covariances_and_radiance():
     assert torch.allclose(covariance(moved), turn @ covariance(rest) @ turn.T, atol=1e-6)
     assert torch.allclose(moved.harmonics[:, 0], rest.harmonics[:, 0])
     assert not torch.allclose(moved.harmonics[:, 1:], rest.harmonics[:, 1:], atol=1e-2)
+
+
+@pytest.mark.parametrize("degree", [0, 2])
+def test_fused_posing_equals_sampling_activation_and_posing_in_turn(degree):
+    generator = torch.Generator().manual_seed(1)
+
+    def random(*shape):
+        return torch.randn(*shape, generator=generator)
+
+    n, channels = 60, 8 + 3 * (degree + 1) ** 2
+    template = GaussianParameters(random(n, 3), degree)
+    with torch.no_grad():
+        for parameter in template.parameters():
+            parameter.add_(0.5 * random(*parameter.shape))
+        # Both limits of the scales are met.
+        template.log_scales[:5] = -12.0
+        template.log_scales[5:10] = 1.0
+    rows, columns = torch.randint(24, (n,), generator=generator), torch.randint(16, (n,), generator=generator)
+    taps = bilinear_taps(rows, columns, 4, (6, 4))
+    axes = matrix_from_axis_angle(random(n, 3))
+    turns = matrix_from_axis_angle(random(2, n, 3))
+    blended = torch.cat([turns * 1.1, random(2, n, 3, 1)], -1)
+    offset, appearance = (random(2, c, 6, 4).mul(0.2).requires_grad_() for c in (3, channels))
+    leaves = [offset, appearance, *template.parameters()]
+
+    offsets = (axes * sample(offset, taps)[..., None, :]).sum(-1)
+    expected = pose_gaussians(template.activate(offsets, sample(appearance, taps)), blended)
+    fused = pose_fused(template, offset, appearance, taps, axes, blended)
+    fields = [[value for g in both for value in vars(g).values()] for both in (expected, fused)]
+    for slow, fast in zip(*fields, strict=True):
+        assert torch.allclose(slow, fast, atol=1e-6)
+    arriving = [random(*value.shape) for value in fields[0]]
+    gradients = [torch.autograd.grad(values, leaves, arriving) for values in fields]
+    for slow, fast in zip(*gradients, strict=True):
+        assert slow.abs().max() > 0
+        assert torch.allclose(slow, fast, atol=1e-4, rtol=1e-4)
