@@ -114,24 +114,30 @@ class ScheduleConfig:
     """Updates in all."""
     minutes: float | None = None
     """Wall-clock budget: the schedule is compressed to fit when the machine is too slow for `steps`."""
-    template_share: float = 0.08
+    template_share: float = 0.12
     """Share of the updates that fit the template alone, on near-rest frames."""
-    pose_share: float = 0.15
+    pose_share: float = 0.0
     """Share that trains the network without feedback and memory (the paper's stage 1)."""
     half_resolution_share: float = 0.75
-    """Share trained on images of half the size."""
-    streams: int = 2
+    """Share trained on images of half the size; the template is fitted to whole ones."""
+    streams: int = 6
     """Rollouts that one worker advances together."""
     views: int = 1
-    """Cameras rendered per rollout and frame."""
+    """Cameras rendered per rollout and rendered frame."""
+    rendered: float = 1.0
+    """Share of the frames, drawn by chance, that are rendered and compared; the network sees all."""
     segment: int = 4
     """Frames K of truncated back-propagation through time."""
-    horizon: int = 16
-    """Frames after which a rollout restarts when feedback begins; it grows to whole clips."""
+    horizon: int = 0
+    """Frames after which a rollout restarts when feedback begins; it doubles until clips are whole.
+    0: whole clips from the start (a rollout that starts cold in mid-motion teaches the wrong thing)."""
     learning_rate: float = 2e-3
-    """Peak rate of the network; cosine to 2 % of it."""
-    warmup: int = 50
-    """Updates of linear warm-up of the network's rate."""
+    """Peak rate of Adam for the network; cosine to 2 % of it."""
+    matrix_rate: float = 0.02
+    """Peak rate of Muon for the network's hidden convolutions, same cosine;
+    0: Adam trains them too (the paper's)."""
+    warmup: float = 0.03
+    """Share of the network's training in which its rates rise from zero."""
     template_rate: float = 0.02
     """Factor on the template's rates once the network trains."""
     clip: float = 1.0
@@ -212,7 +218,15 @@ PRESETS: dict[str, TrainConfig] = {
             appearance_scale=1.0,
         ),
         loss=LossConfig(pyramid=1, ssim=0.2, lpips=0.5, alpha=0.0, temporal_scale=1.0),
-        schedule=ScheduleConfig(steps=300_000, learning_rate=6e-4, half_resolution_share=0.0, streams=1),
+        schedule=ScheduleConfig(
+            steps=300_000,
+            learning_rate=6e-4,
+            half_resolution_share=0.0,
+            streams=1,
+            pose_share=0.15,
+            horizon=16,
+            matrix_rate=0.0,
+        ),
     ),
 }
 

@@ -55,6 +55,12 @@ class DualStreamNetwork(nn.Module):
         self.mixing = nn.ModuleList(TemporalMixing(c, config.window) for c in channels[:-1])
         self.decoder = Decoder(channels, 3 + config.appearance_channels)
 
+    def hidden_weights(self) -> list[nn.Parameter]:
+        """Return the convolutions' weights between the inputs and the head."""
+        named = self.named_modules()
+        convolutions = [m for _, m in named if isinstance(m, nn.Conv2d | nn.ConvTranspose2d)]
+        return [m.weight for m in convolutions if m is not self.decoder.head]
+
     def start(self, batch: int) -> NetworkState:
         """Return the state of rollouts that have seen nothing yet."""
         c, (h, w) = self.config, self.occupied.shape[2:]

@@ -7,10 +7,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dsar.errors import CaptureError, ConfigError
+from dsar.raster.conventions import EPS_2D
 from dsar.raster.reference import rasterize_reference
 from dsar.types import Camera, Gaussians, RenderOutput
 
-__all__ = ["rasterize"]
+__all__ = ["rasterize", "reduced_dilation"]
 
 
 def rasterize(
@@ -19,6 +20,7 @@ def rasterize(
     *,
     background: Float[Tensor, "3"] | None = None,
     directions: Float[Tensor, "n 3"] | None = None,
+    dilation: float = EPS_2D,
     backend: Literal["auto", "reference", "cpu"] = "auto",
 ) -> RenderOutput:
     """Blend Gaussians front to back into colour, alpha and depth (3D Gaussian Splatting, as gsplat 1.5.3).
@@ -32,6 +34,8 @@ def rasterize(
         background: sRGB that shows through the transmittance left over; by default black.
         directions: unit directions in which the harmonics are evaluated (an avatar's are those of its
             canonical pose); by default from the camera's centre to each mean in the world.
+        dilation: pixels² added to both diagonal entries of the image-plane covariance; see `reduced_dilation`
+            for images that are compared with block averages of larger ones.
         backend: `cpu` (Numba, float32), `reference` (plain torch, any dtype and device, 20 times slower), or
             `auto`: `cpu` for float32 tensors in main memory, else `reference`.
 
@@ -47,7 +51,7 @@ def rasterize(
     fits_kernels = gaussians.means.dtype == torch.float32 and gaussians.means.device.type == "cpu"
     wants_camera_gradient = camera.K.requires_grad or camera.T_camera_world.requires_grad
     if backend == "reference" or (backend == "auto" and not fits_kernels):
-        return rasterize_reference(gaussians, camera, background, directions)
+        return rasterize_reference(gaussians, camera, background, directions, dilation)
     if not fits_kernels:
         found = f"{gaussians.means.dtype} on {gaussians.means.device}"
         raise ConfigError(f"rasterize: the cpu backend takes float32 tensors in main memory, not {found}")
@@ -56,7 +60,16 @@ def rasterize(
     # Here, not above: importing the kernels takes a while, and reference users need none.
     from dsar.raster.cpu import rasterize_cpu
 
-    return rasterize_cpu(gaussians, camera, background, directions)
+    return rasterize_cpu(gaussians, camera, background, directions, dilation)
+
+
+def reduced_dilation(factor: int) -> float:
+    """Return the dilation with which an image of 1/factor of the size equals block averages of the whole one.
+
+    Averaging blocks of n x n pixels adds (n² - 1) / 12 pixels² to a splat's variance. With the usual dilation
+    Gaussians fitted to small images come out too small for large ones (Yu et al. 2024, Mip-Splatting).
+    """
+    return (EPS_2D + (factor**2 - 1) / 12) / factor**2
 
 
 def _check_camera(camera: Camera) -> None:

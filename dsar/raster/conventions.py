@@ -5,7 +5,8 @@ Compiled kernels bake them in: after a change, delete the kernel cache (`__pycac
 """
 
 EPS_2D = 0.3
-"""Added to both diagonal entries of the image-plane covariance, pixels²: no splat is thinner than a pixel."""
+"""Added to both diagonal entries of the image-plane covariance, pixels²: no splat is thinner than a pixel.
+Callers may choose another (`rasterize(dilation=)`)."""
 ALPHA_MAX = 0.999
 """A single Gaussian never hides what is behind it completely."""
 ALPHA_MIN = 1 / 255

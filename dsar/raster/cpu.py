@@ -15,6 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from dsar.raster.conventions import EPS_2D
 from dsar.raster.kernels_binning import bin_splats, gather_slots_part
 from dsar.raster.kernels_compositing import (
     SUMS_SIZE,
@@ -40,14 +41,19 @@ def rasterize_cpu(
     camera: Camera,
     background: Float[Tensor, "3"] | None = None,
     directions: Float[Tensor, "n 3"] | None = None,
+    dilation: float = EPS_2D,
 ) -> RenderOutput:
     """Rasterise with Numba: `dsar.raster.rasterize` without its checks, for float32 in main memory."""
     _load_kernels()
-    return _apply(gaussians, camera, background, directions)
+    return _apply(gaussians, camera, background, directions, dilation)
 
 
 def _apply(
-    gaussians: Gaussians, camera: Camera, background: Tensor | None, directions: Tensor | None
+    gaussians: Gaussians,
+    camera: Camera,
+    background: Tensor | None,
+    directions: Tensor | None,
+    dilation: float,
 ) -> RenderOutput:
     color, alpha, depth = _Rasterize.apply(
         gaussians.means,
@@ -58,6 +64,7 @@ def _apply(
         directions,
         background,
         camera,
+        dilation,
     )  # type: ignore[misc]  # autograd's apply is untyped
     return RenderOutput(color, alpha, depth)
 
@@ -67,12 +74,12 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor, Tensor]:
-        *tensors, camera = inputs
+        *tensors, camera, dilation = inputs
         ctx.set_materialize_grads(False)
         means, rotations, scales, opacities, harmonics = (_as_array(tensor) for tensor in tensors[:5])
         directions, background = _as_array(tensors[5], _NO_DIRECTIONS), _as_array(tensors[6], _BLACK)
         n, width, height = len(means), camera.width, camera.height
-        view, center = _pack_camera(camera)
+        view, center = _pack_camera(camera, dilation)
         records, bounds = np.empty((n, RECORD_SIZE), np.float32), np.empty((n, 4), np.int32)
         run_parts(_prepare_part, means, rotations, scales, opacities, harmonics, directions,
                   view, center, width, height, records, bounds)  # fmt: skip
@@ -111,7 +118,7 @@ class _Rasterize(torch.autograd.Function):
         v_background = None
         if ctx.needs_input_grad[6] and v_outputs[0] is not None:
             v_background = torch.einsum("hw,hwc->c", 1 - alpha, v_outputs[0])
-        return *v_inputs[:5], v_directions, v_background, None
+        return *v_inputs[:5], v_directions, v_background, None, None
 
 
 def _prepare_part(
@@ -141,13 +148,13 @@ def _as_array(tensor: Tensor | None, missing: np.ndarray = _BLACK) -> np.ndarray
     return missing if tensor is None else tensor.detach().contiguous().numpy()
 
 
-def _pack_camera(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Return the kernels' camera (rotation, translation, fx, fy, cx, cy) and its centre in the world."""
+def _pack_camera(camera: Camera, dilation: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the kernels' camera (17 numbers, see kernels_projection) and its centre in the world."""
     transform, K = camera.T_camera_world.detach().numpy(), camera.K.detach().numpy()
     rotation, translation = transform[:3, :3], transform[:3, 3]
-    view = np.empty(16, np.float32)
+    view = np.empty(17, np.float32)
     view[:9], view[9:12] = rotation.ravel(), translation
-    view[12:] = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    view[12:] = K[0, 0], K[1, 1], K[0, 2], K[1, 2], dilation
     return view, (-rotation.T @ translation).astype(np.float32)
 
 
@@ -163,5 +170,5 @@ def _load_kernels() -> None:
             torch.tensor([[0.0, 0.0, 1.0]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]]), torch.ones(1, 3),
             torch.full((1,), 0.5), torch.zeros(1, 1, 3),
         ).map(Tensor.requires_grad_)  # fmt: skip
-        _apply(one, camera, None, None).color.sum().backward()
+        _apply(one, camera, None, None, EPS_2D).color.sum().backward()
     _log.info("Rasteriser ready after %.1f s", time.perf_counter() - start)

@@ -9,19 +9,17 @@ mean x, mean y, stretch, shear, height, opacity, red, green, blue, z, first row,
 to kernels_shading. Bounds are the pixels first x, end x, first y, end y; all 0 if a Gaussian is not drawn.
 
 Every kernel takes `part` of `parts` and touches only those rows, so results do not depend on their number.
-The camera is 16 numbers: rotation (row-major 9), translation (3), fx, fy, cx, cy.
+The camera is 17 numbers: rotation (row-major 9), translation (3), fx, fy, cx, cy, and the splats' dilation.
 """
 
 import math
 
 import numpy as np
 
-from dsar.raster.conventions import ALPHA_MIN, EPS_2D, FRUSTUM_MARGIN, NEAR
+from dsar.raster.conventions import ALPHA_MIN, FRUSTUM_MARGIN, NEAR
 from dsar.raster.jit import inlined, kernel
 
 RECORD_SIZE = 12
-_EPS = np.float32(EPS_2D)
-_EPS_SQUARED = np.float32(EPS_2D * EPS_2D)
 _NEAR = np.float32(NEAR)
 _MARGIN = np.float32(0.5 * FRUSTUM_MARGIN)
 _ALPHA_MIN = np.float32(ALPHA_MIN)
@@ -115,7 +113,7 @@ def _scaled(g, scales, i):
 
 
 @inlined
-def _covariance(m1, m2):
+def _covariance(m1, m2, dilation):
     """Return (A, B, C, A - B²/C) of the image-plane covariance [[A, B], [B, C]], pixels².
 
     The determinant comes from the cross product, which keeps its digits for thin splats.
@@ -124,9 +122,9 @@ def _covariance(m1, m2):
     nx = m1[1] * m2[2] - m1[2] * m2[1]
     ny = m1[2] * m2[0] - m1[0] * m2[2]
     nz = m1[0] * m2[1] - m1[1] * m2[0]
-    c = c0 + _EPS
-    determinant = nx * nx + ny * ny + nz * nz + _EPS * (a0 + c0) + _EPS_SQUARED
-    return a0 + _EPS, b, c, determinant / c
+    c = c0 + dilation
+    determinant = nx * nx + ny * ny + nz * nz + dilation * (a0 + c0) + dilation * dilation
+    return a0 + dilation, b, c, determinant / c
 
 
 @inlined
@@ -153,7 +151,7 @@ def project_part(part, parts, means, rotations, scales, opacities, camera, width
         rows = _rotation_rows(w, x, y, z)
         u1, u2, _, _ = _image_axes(point, camera, width, height)
         m1, m2 = _scaled(_times_matrix(u1, rows), scales, i), _scaled(_times_matrix(u2, rows), scales, i)
-        a, b, c, slim = _covariance(m1, m2)
+        a, b, c, slim = _covariance(m1, m2, camera[16])
         mean_x = camera[12] * point[0] / point[2] + camera[14]
         mean_y = camera[13] * point[1] / point[2] + camera[15]
         # Not math.isfinite: it subtracts the value from itself, which the compiler may fold to zero.
@@ -245,7 +243,7 @@ def project_backward_part(
         u1, u2, free_x, free_y = _image_axes(point, camera, width, height)
         g1, g2 = _times_matrix(u1, rows), _times_matrix(u2, rows)
         m1, m2 = _scaled(g1, scales, i), _scaled(g2, scales, i)
-        a, b, c, slim = _covariance(m1, m2)
+        a, b, c, slim = _covariance(m1, m2, camera[16])
         v_x, v_y, v_a, v_b, v_c = _splat_gradient(sums, i, a, b, c, slim)
         v_m1 = (
             _TWO * v_a * m1[0] + v_b * m2[0],

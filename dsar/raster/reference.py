@@ -31,7 +31,7 @@ class _Splats:
     means: Float[Tensor, "n 2"]
     """Pixels."""
     covariances: Float[Tensor, "n 2 2"]
-    """Pixels², dilated by EPS_2D."""
+    """Pixels², dilated."""
     opacities: Float[Tensor, " n"]
     features: Float[Tensor, "n 4"]
     """Red, green, blue, and camera depth in metres."""
@@ -44,12 +44,13 @@ def rasterize_reference(
     camera: Camera,
     background: Float[Tensor, "3"] | None = None,
     directions: Float[Tensor, "n 3"] | None = None,
+    dilation: float = EPS_2D,
 ) -> RenderOutput:
     """Rasterise in plain torch: `dsar.raster.rasterize` without its checks, for any dtype and device."""
     drawable = _find_drawable(gaussians, camera, directions)
     # Selected before anything is computed: what is left out cannot send NaN back through a zero gradient.
     gaussians = gaussians.map(lambda values: values[drawable])
-    splats = _splat(gaussians, camera, directions if directions is None else directions[drawable])
+    splats = _splat(gaussians, camera, directions if directions is None else directions[drawable], dilation)
     rows = [
         torch.cat([_composite_tile(splats, x, y, camera) for x in range(0, camera.width, _TILE)], 1)
         for y in range(0, camera.height, _TILE)
@@ -67,7 +68,7 @@ def _find_drawable(
     gaussians: Gaussians, camera: Camera, directions: Float[Tensor, "n 3"] | None
 ) -> Bool[Tensor, " n"]:
     """Return which Gaussians are in front, visible, of positive scale, and finite in all they project to."""
-    means, covariances, depths = _project(gaussians, camera)
+    means, covariances, depths = _project(gaussians, camera, EPS_2D)
     drawable = (depths > NEAR) & (gaussians.opacities >= ALPHA_MIN) & (gaussians.scales > 0).all(-1)
     drawable &= gaussians.rotations.norm(dim=-1) > 0
     colors = _shade(gaussians, camera, directions)
@@ -76,9 +77,11 @@ def _find_drawable(
     return drawable
 
 
-def _splat(gaussians: Gaussians, camera: Camera, directions: Float[Tensor, "n 3"] | None) -> _Splats:
+def _splat(
+    gaussians: Gaussians, camera: Camera, directions: Float[Tensor, "n 3"] | None, dilation: float
+) -> _Splats:
     """Return drawable Gaussians on the image, front to back, ties in their own order."""
-    means, covariances, depths = _project(gaussians, camera)
+    means, covariances, depths = _project(gaussians, camera, dilation)
     features = torch.cat([_shade(gaussians, camera, directions), depths[:, None]], -1)
     reach = 2 * (gaussians.opacities.detach() / ALPHA_MIN).log()
     variances = covariances.detach().diagonal(dim1=-2, dim2=-1)
@@ -99,9 +102,9 @@ def _shade(
 
 
 def _project(
-    gaussians: Gaussians, camera: Camera
+    gaussians: Gaussians, camera: Camera, dilation: float
 ) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2 2"], Float[Tensor, " n"]]:
-    """Return means in pixels, covariances in pixels² (dilated by EPS_2D) and camera depths in metres.
+    """Return means in pixels, covariances in pixels² (dilated) and camera depths in metres.
 
     The perspective map is linearised at the mean, held inside the widened image (Zwicker et al. 2001).
     """
@@ -116,7 +119,7 @@ def _project(
     jacobian = torch.cat([torch.diag_embed(focal / z), -(focal * limited / z)[..., None]], -1)
     axes = matrix_from_quaternion(gaussians.rotations) * gaussians.scales[:, None, :]
     spread = jacobian @ transform[:3, :3] @ axes
-    covariances = spread @ spread.mT + EPS_2D * torch.eye(2).to(spread)
+    covariances = spread @ spread.mT + dilation * torch.eye(2).to(spread)
     return focal * tangents + center, covariances, z[:, 0]
 
 

@@ -3,7 +3,7 @@
 config.json              every setting of the run
 checkpoint/              replaced as a whole, never half written
     avatar.safetensors       parameters, skeleton, atlas
-    optimizer.safetensors    moments of the optimiser
+    adam.safetensors, muon.safetensors   moments of the optimisers
     rollouts-<rank>.safetensors, rollouts-<rank>.json   carried state of each worker's rollouts
     progress.json            step, progress, format version
 metrics.jsonl            one line per report
@@ -102,20 +102,22 @@ def save_avatar(avatar: Avatar, folder: Path) -> None:
     save_file(tensors, folder / "avatar.safetensors")
 
 
-def save_optimizer(optimizer: torch.optim.Optimizer, folder: Path) -> None:
-    """Write the optimiser's moments; the parameters' order is the key."""
-    state = optimizer.state_dict()["state"]
-    tensors = {f"{index}.{name}": value for index, slot in state.items() for name, value in slot.items()}
-    save_file(tensors, folder / "optimizer.safetensors")
+def save_optimizers(optimizers: Mapping[str, torch.optim.Optimizer], folder: Path) -> None:
+    """Write the optimisers' moments; the parameters' order is the key."""
+    for label, optimizer in optimizers.items():
+        state = optimizer.state_dict()["state"]
+        tensors = {f"{index}.{name}": value for index, slot in state.items() for name, value in slot.items()}
+        save_file(tensors, folder / f"{label}.safetensors")
 
 
-def load_optimizer(optimizer: torch.optim.Optimizer, folder: Path) -> None:
-    """Restore what `save_optimizer` wrote."""
-    state: dict[int, dict[str, Tensor]] = {}
-    for key, value in load_file(folder / "optimizer.safetensors").items():
-        index, name = key.split(".", 1)
-        state.setdefault(int(index), {})[name] = value
-    optimizer.load_state_dict({**optimizer.state_dict(), "state": state})
+def load_optimizers(optimizers: Mapping[str, torch.optim.Optimizer], folder: Path) -> None:
+    """Restore what `save_optimizers` wrote."""
+    for label, optimizer in optimizers.items():
+        state: dict[int, dict[str, Tensor]] = {}
+        for key, value in load_file(folder / f"{label}.safetensors").items():
+            index, name = key.split(".", 1)
+            state.setdefault(int(index), {})[name] = value
+        optimizer.load_state_dict({**optimizer.state_dict(), "state": state})
 
 
 def save_rollouts(folder: Path, rank: int, tensors: Mapping[str, Tensor], places: Any) -> None:

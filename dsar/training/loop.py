@@ -6,7 +6,7 @@ import math
 import shutil
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,13 +18,14 @@ from torch import nn
 from dsar.avatar.avatar import Avatar
 from dsar.avatar.stillness import stillest_frames
 from dsar.body.files import load_body
-from dsar.config import TrainConfig, config_from_json, config_to_json
+from dsar.config import ScheduleConfig, TrainConfig, config_from_json, config_to_json
 from dsar.data.capture import open_capture
 from dsar.errors import CaptureError, CheckpointError, ConfigError, TrainingError
 from dsar.training import checkpoint as ckpt
 from dsar.training import workers
 from dsar.training.checkpoint import Run
 from dsar.training.lpips import load_lpips
+from dsar.training.muon import Muon
 from dsar.training.segment import Progress, SegmentTrainer
 from dsar.training.stages import Position, position
 from dsar.types import Capture
@@ -115,20 +116,20 @@ def _train(config: TrainConfig, folder: Path, resume: bool, report: Reporter | N
     lpips = load_lpips("alex") if config.loss.lpips else None
     trainer = SegmentTrainer(config, capture, avatar.train(), training_clips(config, capture), lpips)
     still = still_frames(trainer, avatar.fps)
-    optimizer = make_optimizer(avatar)
+    optimizers = make_optimizers(avatar, config.schedule)
     gradients = workers.Gradients(list(avatar.parameters()))
     step, progress = 0, 0.0
     if resume:
         at = ckpt.read_progress(run)
         step, progress = at["step"], at["progress"]
-        ckpt.load_optimizer(optimizer, run.checkpoint)
+        ckpt.load_optimizers(optimizers, run.checkpoint)
         trainer.carry_on(*ckpt.load_rollouts(run.checkpoint, workers.rank()))
     resumed_at, began = progress, time.monotonic()
     smoothed: Progress | None = None
     with _stop_signals() as received:
         while progress < 1:
-            now = position(config.schedule, progress, step)
-            set_rates(optimizer, now)
+            now = position(config.schedule, progress)
+            set_rates(optimizers, now)
             rng = np.random.default_rng([config.seed, workers.rank(), step])
             gradients.clear()
             done = _segment(trainer, rng, now, still, step)
@@ -136,7 +137,8 @@ def _train(config: TrainConfig, folder: Path, resume: bool, report: Reporter | N
             if not gradients.buffer.isfinite().all():
                 raise TrainingError(f"step {step}: the gradient of {bad_gradient(avatar)} is not finite")
             nn.utils.clip_grad_norm_(avatar.network.parameters(), config.schedule.clip)
-            optimizer.step()
+            for optimizer in optimizers.values():
+                optimizer.step()
             step += 1
             progress = step / config.schedule.steps
             if config.schedule.minutes is not None:
@@ -145,7 +147,7 @@ def _train(config: TrainConfig, folder: Path, resume: bool, report: Reporter | N
             if workers.rank() == 0 and (step % REPORT_EVERY == 0 or progress >= 1):
                 _report(run, config, step, progress, now, smoothed, time.monotonic() - began, report)
             if stop or progress >= 1 or step % SAVE_EVERY == 0:
-                save(run, avatar, optimizer, trainer, step, progress)
+                save(run, avatar, optimizers, trainer, step, progress)
             if stop:
                 _leave(received)
                 return
@@ -201,21 +203,28 @@ def still_frames(trainer: SegmentTrainer, fps: float) -> list[tuple[str, int]]:
     return stillest_frames(tracks, fps, STILL_FRAMES, per_sequence)
 
 
-def make_optimizer(avatar: Avatar) -> torch.optim.Adam:
-    """Return Adam over the network and each field of the template, at rates set anew each update.
+def make_optimizers(avatar: Avatar, schedule: ScheduleConfig) -> dict[str, torch.optim.Optimizer]:
+    """Return Muon for the network's hidden convolutions and Adam for all else; rates are set each update.
 
-    Epsilon is far below the default: inner gradients of this network are smaller than 1e-8.
+    Adam's epsilon is far below the default: inner gradients of this network are smaller than 1e-8.
     """
-    groups = [{"params": list(avatar.network.parameters()), "name": "network"}]
+    hidden = avatar.network.hidden_weights() if schedule.matrix_rate else []
+    chosen = {id(weight) for weight in hidden}
+    rest = [p for p in avatar.network.parameters() if id(p) not in chosen]
+    groups = [{"params": rest, "name": "network"}]
     groups += [{"params": [p], "name": name} for name, p in avatar.template.named_parameters()]
-    return torch.optim.Adam(groups, lr=0.0, betas=(0.9, 0.99), eps=1e-15, fused=True)
+    adam = torch.optim.Adam(groups, lr=0.0, betas=(0.9, 0.99), eps=1e-15, fused=True)
+    return {"adam": adam} | ({"muon": Muon(hidden)} if hidden else {})
 
 
-def set_rates(optimizer: torch.optim.Optimizer, now: Position) -> None:
+def set_rates(optimizers: Mapping[str, torch.optim.Optimizer], now: Position) -> None:
     """Set the learning rates of this update."""
-    for group in optimizer.param_groups:
+    for group in optimizers["adam"].param_groups:
         name = group["name"]
         group["lr"] = now.network_rate if name == "network" else _TEMPLATE_RATES[name] * now.template_factor
+    if "muon" in optimizers:
+        for group in optimizers["muon"].param_groups:
+            group["lr"] = now.matrix_rate
 
 
 def bad_gradient(avatar: Avatar) -> str:
@@ -227,7 +236,7 @@ def bad_gradient(avatar: Avatar) -> str:
 def save(
     run: Run,
     avatar: Avatar,
-    optimizer: torch.optim.Optimizer,
+    optimizers: Mapping[str, torch.optim.Optimizer],
     trainer: SegmentTrainer,
     step: int,
     progress: float,
@@ -238,7 +247,7 @@ def save(
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir()
         ckpt.save_avatar(avatar, folder)
-        ckpt.save_optimizer(optimizer, folder)
+        ckpt.save_optimizers(optimizers, folder)
     workers.barrier()
     ckpt.save_rollouts(folder, workers.rank(), *trainer.carried())
     workers.barrier()

@@ -73,7 +73,7 @@ def image_loss(
     if lpips is not None:
         pair = [image.permute(2, 0, 1)[None].clamp(0, 1) for image in (output.color, truth)]
         loss = loss + config.lpips * lpips(*pair).mean()
-    return loss, (output.color.detach() - truth).square().mean()
+    return loss, (output.color - truth).detach().square().mean()
 
 
 @dataclass(frozen=True)

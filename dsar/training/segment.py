@@ -12,12 +12,15 @@ from dsar.config import TrainConfig
 from dsar.errors import TrainingError
 from dsar.network import NetworkOutput, NetworkState
 from dsar.network.maps import FrameMaps
-from dsar.raster import rasterize
+from dsar.raster import rasterize, reduced_dilation
 from dsar.training.losses import TemporalRecord, image_loss, temporal_loss
 from dsar.training.stages import Position
 from dsar.training.streams import Stream, Streams
 from dsar.training.targets import load_target
 from dsar.types import Capture, Gaussians
+
+TEMPLATE_FRAMES = 8
+"""Frames of an update of the template alone."""
 
 
 @dataclass(frozen=True)
@@ -51,15 +54,14 @@ class SegmentTrainer:
         self, rng: np.random.Generator, still: list[tuple[str, int]], reduction: int
     ) -> Progress:
         """Back-propagate views of the template alone on still frames."""
-        count = self.config.schedule.streams * self.config.schedule.segment
         loss, mse = torch.zeros(()), torch.zeros(())
-        for index in rng.choice(len(still), count):
+        for index in rng.choice(len(still), TEMPLATE_FRAMES):
             name, frame = still[index]
             context = contexts(self.tracks[name], torch.tensor([frame]))
             gaussians = self.avatar.gaussians(context, None)[0]
             view = self._views(rng, gaussians, name, frame, reduction)
             loss, mse = loss + view[0], mse + view[1]
-        return self._finish(loss, mse, count * self.config.schedule.views)
+        return self._finish(loss, mse, TEMPLATE_FRAMES * self.config.schedule.views)
 
     def segment(self, rng: np.random.Generator, position: Position) -> Progress:
         """Advance every rollout by K frames and back-propagate through them."""
@@ -72,6 +74,8 @@ class SegmentTrainer:
             output, self.state, observed = self.avatar.advance(context, self.state, streams=with_streams)
             gaussians = self.avatar.gaussians(context, output)
             for place, each in zip(places, gaussians, strict=True):
+                if rng.random() >= schedule.rendered:
+                    continue
                 view = self._views(rng, each, place.sequence, place.frame, position.reduction)
                 loss, mse, count = loss + view[0], mse + view[1], count + schedule.views
             if with_streams:
@@ -124,7 +128,9 @@ class SegmentTrainer:
         for index in rng.choice(len(self.capture.cameras), self.config.schedule.views, replace=False):
             target = load_target(self.capture, sequence, frame, int(index), reduction)
             background = torch.from_numpy(rng.random(3, np.float32))
-            output = rasterize(gaussians, target.camera, background=background)
+            output = rasterize(
+                gaussians, target.camera, background=background, dilation=reduced_dilation(reduction)
+            )
             one, error = image_loss(output, target, background, self.config.loss, self.lpips)
             loss, mse = loss + one, mse + error
         return loss, mse

@@ -23,25 +23,34 @@ class Position:
     reduction: int
     """Factor by which images are reduced."""
     network_rate: float
-    """Learning rate of the network."""
+    """Adam's learning rate for the network."""
+    matrix_rate: float
+    """Muon's learning rate for the network's hidden convolutions."""
     template_factor: float
     """Factor on the template's learning rates."""
 
 
-def position(schedule: ScheduleConfig, progress: float, step: int) -> Position:
+def position(schedule: ScheduleConfig, progress: float) -> Position:
     """Return the settings at a progress in [0, 1)."""
-    reduction = 2 if progress < schedule.half_resolution_share else 1
     if progress < schedule.template_share:
-        return Position("template", 1, reduction, 0.0, 1.0)
+        factor = _cosine(progress / schedule.template_share, 0.1)
+        return Position("template", 1, 1, 0.0, 0.0, factor)
+    reduction = 2 if progress < schedule.half_resolution_share else 1
     trained = (progress - schedule.template_share) / (1 - schedule.template_share)
-    cosine = 0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * trained))
-    warmup = min(1.0, (1 + step) / max(schedule.warmup, 1))
-    rate = schedule.learning_rate * cosine * warmup
+    cosine = _cosine(trained, 0.02)
+    warm = cosine * min(1.0, (trained + 1e-3) / max(schedule.warmup, 1e-3))
+    rates = schedule.learning_rate * warm, schedule.matrix_rate * warm
     factor = schedule.template_rate * cosine
+    horizon = schedule.horizon or WHOLE_CLIP
     streams_from = schedule.template_share + schedule.pose_share
     if progress < streams_from:
-        return Position("pose", schedule.horizon, reduction, rate, factor)
+        return Position("pose", horizon, reduction, *rates, factor)
     grown = (progress - streams_from) / (1 - streams_from)
     doublings = int(grown * 8)
-    horizon = schedule.horizon * 2**doublings if doublings < 4 else WHOLE_CLIP
-    return Position("autoregressive", horizon, reduction, rate, factor)
+    horizon = horizon * 2**doublings if doublings < 4 else WHOLE_CLIP
+    return Position("autoregressive", horizon, reduction, *rates, factor)
+
+
+def _cosine(progress: float, end: float) -> float:
+    """Return half a cosine from 1 at progress 0 to `end` at 1."""
+    return end + (1 - end) * 0.5 * (1 + math.cos(math.pi * progress))

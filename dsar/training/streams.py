@@ -29,13 +29,14 @@ class Streams:
         """Return where each rollout stands, and which of them start afresh with this frame.
 
         A rollout restarts at the end of its clip or after `horizon` frames: in the middle of a clip
-        while the horizon is short, at a clip's first frame (where cloth is at rest) once it is not.
+        while the horizon is short, at a clip's first frame (where cloth is at rest) once it is not. The
+        first start of all is anywhere, or rollouts of whole clips would march in step.
         """
         fresh = []
         for index, stream in enumerate(self.streams):
             over = stream is None or stream.frame >= self.clips[stream.sequence].stop or stream.age >= horizon
             if over:
-                self.streams[index] = self._restart(rng, horizon)
+                self.streams[index] = self._restart(rng, horizon, anywhere=stream is None)
             fresh.append(over)
         return [stream for stream in self.streams if stream is not None], fresh
 
@@ -45,11 +46,11 @@ class Streams:
             if stream is not None:
                 stream.frame, stream.age = stream.frame + 1, stream.age + 1
 
-    def _restart(self, rng: np.random.Generator, horizon: int) -> Stream:
+    def _restart(self, rng: np.random.Generator, horizon: int, *, anywhere: bool) -> Stream:
         names = list(self.clips)
         lengths = np.array([len(self.clips[name]) for name in names], float)
         name = names[rng.choice(len(names), p=lengths / lengths.sum())]
         clip = self.clips[name]
-        latest = clip.stop - horizon
+        latest = clip.stop - (1 if anywhere else horizon)
         start = int(rng.integers(clip.start, latest + 1)) if latest > clip.start else clip.start
         return Stream(name, start, 0)

@@ -61,13 +61,14 @@ def test_one_fitted_frame_covers_the_mask(capture, sequence, frame):
     config = TrainConfig()
     avatar = Avatar.from_capture(capture, capture.body, config.atlas, config.model).train()
     trainer = SegmentTrainer(config, capture, avatar, {sequence: range(frame + 1)}, None)
-    optimizer, gradients = loop.make_optimizer(avatar), Gradients(list(avatar.parameters()))
+    optimizers = loop.make_optimizers(avatar, config.schedule)
+    gradients = Gradients(list(avatar.parameters()))
     for step in range(110):
         reduction, factor = (2, 1.0) if step < 50 else (1, 0.5)
-        loop.set_rates(optimizer, Position("template", 1, reduction, 0.0, factor))
+        loop.set_rates(optimizers, Position("template", 1, reduction, 0.0, 0.0, factor))
         gradients.clear()
         trainer.template_segment(np.random.default_rng(step), [(sequence, frame)], reduction)
-        optimizer.step()
+        optimizers["adam"].step()
     solid_recall, soft_recall = [], []
     with torch.no_grad():
         gaussians = avatar.gaussians(contexts(trainer.tracks[sequence], torch.tensor([frame])), None)[0]

@@ -7,10 +7,11 @@ import math
 import numba
 import pytest
 import torch
+from torch import Tensor
 
 from dsar.errors import CaptureError, ConfigError
 from dsar.geometry.harmonics import C0
-from dsar.raster import cpu, rasterize
+from dsar.raster import cpu, rasterize, reduced_dilation
 from dsar.types import Camera, Gaussians
 
 FIELDS = ("means", "rotations", "scales", "opacities", "harmonics")
@@ -299,3 +300,19 @@ def test_inputs_that_do_not_fit_are_refused():
         rasterize(gaussians, dataclasses.replace(camera, K=camera.K.clone().requires_grad_()))
     with pytest.raises(ConfigError, match="one per Gaussian"):
         rasterize(gaussians, camera, directions=torch.zeros(2, 3))
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_small_image_equals_block_averages_of_the_large_one(backend):
+    """Else Gaussians that were fitted to small images come out too thin for large ones."""
+    camera = make_camera(96, 64, 120.0)
+    gaussians = make_gaussians(30, size=0.03, opacity=(0.2, 0.6))
+    if backend == "cpu":
+        gaussians = gaussians.map(Tensor.float)
+    large = rasterize(gaussians, camera, backend=backend).alpha
+    averages = torch.nn.functional.avg_pool2d(large[None, None], 2)[0, 0]
+    small = camera.resized(48, 32)
+    matched = rasterize(gaussians, small, backend=backend, dilation=reduced_dilation(2)).alpha
+    usual = rasterize(gaussians, small, backend=backend).alpha
+    assert (matched - averages).abs().max() < 0.03
+    assert (matched - averages).abs().mean() < 0.2 * (usual - averages).abs().mean()

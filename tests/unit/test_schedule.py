@@ -10,8 +10,8 @@ from dsar.training.streams import Streams
 
 
 def test_stages_follow_each_other_and_the_horizon_only_grows():
-    schedule = ScheduleConfig()
-    walk = [position(schedule, i / 1000, i) for i in range(1000)]
+    schedule = ScheduleConfig(pose_share=0.15, horizon=16)
+    walk = [position(schedule, i / 1000) for i in range(1000)]
     stages = [p.stage for p in walk]
     assert stages == sorted(stages, key=["template", "pose", "autoregressive"].index)
     horizons = [p.horizon for p in walk if p.stage == "autoregressive"]
@@ -42,7 +42,9 @@ def test_a_whole_clip_starts_at_its_first_frame_and_is_seen_to_its_end():
         (place,), _ = streams.next_frames(rng, WHOLE_CLIP)
         seen.append(place.frame)
         streams.advance()
-    assert seen == [*range(3, 10)] * 2
+    # Only the very first start is anywhere, so that several rollouts are out of step.
+    first = seen[0]
+    assert seen == ([*range(first, 10)] + [*range(3, 10)] * 2)[:14]
 
 
 @pytest.mark.parametrize("preset", PRESETS)
