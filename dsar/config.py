@@ -120,11 +120,11 @@ class ScheduleConfig:
     """Share that trains the network without feedback and memory (the paper's stage 1)."""
     half_resolution_share: float = 0.75
     """Share trained on images of half the size; the template is fitted to whole ones."""
-    streams: int = 6
+    streams: int = 12
     """Rollouts that one worker advances together."""
     views: int = 1
     """Cameras rendered per rollout and rendered frame."""
-    rendered: float = 1.0
+    rendered: float = 0.5
     """Share of the frames, drawn by chance, that are rendered and compared; the network sees all."""
     segment: int = 4
     """Frames K of truncated back-propagation through time."""
@@ -223,6 +223,7 @@ PRESETS: dict[str, TrainConfig] = {
             learning_rate=6e-4,
             half_resolution_share=0.0,
             streams=1,
+            rendered=1.0,
             pose_share=0.15,
             horizon=16,
             matrix_rate=0.0,

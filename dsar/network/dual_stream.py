@@ -1,5 +1,6 @@
 """The network of the paper's section 3: one step of the autoregression for a batch of rollouts."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -26,6 +27,12 @@ class NetworkOutput:
     """Residuals of raw values: quaternion 4, log-scale 3, opacity logit 1, harmonics 3k."""
     features: tuple[Float[Tensor, "b _ _ _"], ...]
     """The aggregated hierarchy F, finest level first."""
+
+    def select(self, rollouts: Sequence[int]) -> "NetworkOutput":
+        """Return the output of some rollouts of the batch."""
+        index = list(rollouts)
+        features = tuple(feature[index] for feature in self.features)
+        return NetworkOutput(self.offset[index], self.appearance[index], features)
 
 
 class DualStreamNetwork(nn.Module):

@@ -10,6 +10,7 @@ from torch import Tensor
 from dsar.config import LossConfig
 from dsar.network import NetworkOutput
 from dsar.network.maps import FPS
+from dsar.training.fused_loss import fused_image_loss
 from dsar.training.targets import Target
 from dsar.types import RenderOutput
 
@@ -56,6 +57,20 @@ def _blur_matrix(size: int) -> Float[Tensor, "s s"]:
     return window / torch.exp(-(reach**2) / (2 * _SSIM_SIGMA**2)).sum()
 
 
+def plain_image_loss(
+    color: Float[Tensor, "h w 3"],
+    alpha: Float[Tensor, "h w"],
+    truth: Float[Tensor, "h w 3"],
+    mask: Float[Tensor, "h w"],
+    levels: int,
+    weights: tuple[float, float, float],
+) -> Float[Tensor, ""]:
+    """Return the weighted sum of pyramid L1, 1 - SSIM, and the mean absolute difference of alpha and mask."""
+    l1, similarity, cover = weights
+    loss = l1 * pyramid_l1(color, truth, levels) + cover * (alpha - mask).abs().mean()
+    return loss + similarity * (1 - ssim(color, truth)) if similarity else loss
+
+
 def image_loss(
     output: RenderOutput,
     target: Target,
@@ -65,11 +80,10 @@ def image_loss(
 ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
     """Return L_render of one view over a background, and its mean squared error for reporting."""
     truth = target.color + (1 - target.alpha[..., None]) * background
-    loss = config.l1 * pyramid_l1(output.color, truth, config.pyramid)
-    if config.ssim:
-        loss = loss + config.ssim * (1 - ssim(output.color, truth))
-    if config.alpha:
-        loss = loss + config.alpha * (output.alpha - target.alpha).abs().mean()
+    on_cpu = truth.dtype == torch.float32 and truth.device.type == "cpu"
+    compare = fused_image_loss if on_cpu else plain_image_loss
+    weights = (config.l1, config.ssim, config.alpha)
+    loss = compare(output.color, output.alpha, truth, target.alpha, config.pyramid, weights)
     if lpips is not None:
         pair = [image.permute(2, 0, 1)[None].clamp(0, 1) for image in (output.color, truth)]
         loss = loss + config.lpips * lpips(*pair).mean()

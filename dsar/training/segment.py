@@ -72,16 +72,15 @@ class SegmentTrainer:
             self.state = self.state.restart(torch.tensor(fresh))
             context = torch.cat([contexts(self.tracks[p.sequence], torch.tensor([p.frame])) for p in places])
             output, self.state, observed = self.avatar.advance(context, self.state, streams=with_streams)
-            gaussians = self.avatar.gaussians(context, output)
-            for place, each in zip(places, gaussians, strict=True):
-                if rng.random() >= schedule.rendered:
-                    continue
+            shown = [i for i in range(len(places)) if rng.random() < schedule.rendered]
+            gaussians = self.avatar.gaussians(context[shown], output.select(shown)) if shown else []
+            for place, each in zip((places[i] for i in shown), gaussians, strict=True):
                 view = self._views(rng, each, place.sequence, place.frame, position.reduction)
                 loss, mse, count = loss + view[0], mse + view[1], count + schedule.views
             if with_streams:
                 loss = loss + self._temporal(context, output, observed, places) * len(places) * schedule.views
             self.streams.advance()
-        progress = self._finish(loss, mse, count)
+        progress = self._finish(loss, mse, max(count, 1))
         self.state = self.state.detach()
         for _ in range(len(self.records)):
             self.records.append(self.records.popleft().detach())

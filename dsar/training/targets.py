@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
+from dsar.raster.jit import kernel
 from dsar.types import Camera, Capture
 
 MARGIN = 6
@@ -32,18 +33,37 @@ def load_target(capture: Capture, sequence: str, frame: int, camera_index: int, 
     Premultiplied pixels are averaged, so that the mask's border stays right.
     """
     pixels, camera = capture.image(sequence, frame, camera_index), capture.cameras[camera_index]
-    x0, y0, x1, y1 = (edge // reduction for edge in mask_box(pixels[..., 3], MARGIN * reduction))
-    x1, y1 = max(x1, x0 + 1), max(y1, y0 + 1)
-    inside = slice(y0 * reduction, y1 * reduction), slice(x0 * reduction, x1 * reduction)
-    image = torch.from_numpy(pixels[inside].copy()).permute(2, 0, 1).float() / 255
-    image = torch.cat([image[:3] * image[3:], image[3:]])
     if reduction > 1:
-        image = torch.nn.functional.avg_pool2d(image, reduction)
         width, height = camera.width // reduction, camera.height // reduction
         whole = dataclasses.replace(camera, width=width * reduction, height=height * reduction)
         camera = whole.resized(width, height)
-    color, alpha = image[:3].permute(1, 2, 0).contiguous(), image[3].contiguous()
-    return Target(color, alpha, camera.cropped(x0, y0, x1 - x0, y1 - y0))
+    x0, y0, x1, y1 = (edge // reduction for edge in mask_box(pixels[..., 3], MARGIN * reduction))
+    x1, y1 = min(max(x1, x0 + 1), camera.width), min(max(y1, y0 + 1), camera.height)
+    color, alpha = _premultiplied_means(pixels, x0, y0, x1, y1, reduction)
+    camera = camera.cropped(x0, y0, x1 - x0, y1 - y0)
+    return Target(torch.from_numpy(color), torch.from_numpy(alpha), camera)
+
+
+@kernel
+def _premultiplied_means(pixels, x0, y0, x1, y1, n):
+    """Return colour times alpha and alpha, averaged over n x n pixels, of the blocks x0..x1-1, y0..y1-1."""
+    color, alpha = np.empty((y1 - y0, x1 - x0, 3), np.float32), np.empty((y1 - y0, x1 - x0), np.float32)
+    per_alpha = np.float32(1 / (255 * n * n))
+    per_color = np.float32(1 / (255 * 255 * n * n))
+    for y in range(y0, y1):
+        for x in range(x0, x1):
+            red, green, blue, cover = 0, 0, 0, 0
+            for row in range(y * n, y * n + n):
+                for column in range(x * n, x * n + n):
+                    a = np.int64(pixels[row, column, 3])
+                    red += a * pixels[row, column, 0]
+                    green += a * pixels[row, column, 1]
+                    blue += a * pixels[row, column, 2]
+                    cover += a
+            out = color[y - y0, x - x0]
+            out[0], out[1], out[2] = red * per_color, green * per_color, blue * per_color
+            alpha[y - y0, x - x0] = cover * per_alpha
+    return color, alpha
 
 
 def mask_box(alpha: Shaped[np.ndarray, "h w"], margin: int) -> tuple[int, int, int, int]:

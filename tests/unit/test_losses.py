@@ -1,12 +1,14 @@
 """Losses against independent implementations and their own definitions."""
 
 import numpy as np
+import pytest
 import torch
 from scipy.ndimage import gaussian_filter
 
 from dsar.config import LossConfig
 from dsar.network import NetworkOutput
-from dsar.training.losses import TemporalRecord, pyramid_l1, ssim, temporal_loss
+from dsar.training.fused_loss import fused_image_loss
+from dsar.training.losses import TemporalRecord, plain_image_loss, pyramid_l1, ssim, temporal_loss
 
 
 def images(seed=0, size=(40, 33)):
@@ -83,3 +85,18 @@ def test_motion_anywhere_in_the_record_loosens_the_weight():
     after_a_stop = loss([record(still, speed=0.01), record(moved)], [5], prediction=1.0)
     # 0.01 m a frame at 30 fps is 0.3 m/s: the weight's 1/e point.
     assert abs(after_a_stop / rest - np.exp(-1)) < 1e-5
+
+
+@pytest.mark.parametrize("size", [(37, 22), (64, 48), (7, 5)])
+@pytest.mark.parametrize("weights", [(1.0, 0.1, 0.3), (0.5, 0.0, 0.0), (0.0, 1.0, 0.0)])
+def test_fused_losses_equal_the_plain_ones_in_value_and_gradient(size, weights):
+    generator = torch.Generator().manual_seed(3)
+    truth, mask = torch.rand(*size, 3, generator=generator), torch.rand(*size, generator=generator)
+    color = (truth + 0.3 * torch.randn(*size, 3, generator=generator)).requires_grad_()
+    alpha = torch.rand(*size, generator=generator).requires_grad_()
+    results = []
+    for compare in (plain_image_loss, fused_image_loss):
+        loss = compare(color, alpha, truth, mask, 4, weights)
+        results.append([loss, *torch.autograd.grad(3 * loss, (color, alpha))])
+    for plain, fused in zip(*results, strict=True):
+        assert torch.allclose(plain, fused, rtol=1e-4, atol=1e-6 * float(plain.detach().abs().max()) + 1e-9)
