@@ -8,7 +8,7 @@ RUN ?= runs/demo
 .DELETE_ON_ERROR:
 
 demo: $(STAMP)
-	$(BIN)/dsar train embedded --preset demo --minutes 6.5 --out $(RUN) $(if $(wildcard $(RUN)/checkpoint),--resume)
+	$(BIN)/dsar train embedded --preset demo --minutes 6.3 --out $(RUN) $(if $(wildcard $(RUN)/checkpoint),--resume)
 	$(BIN)/dsar export $(RUN) --usd $(RUN)/out.usda --ply $(RUN)/ply
 	$(BIN)/dsar render $(RUN) --exr $(RUN)/exr --mp4 $(RUN)/out.mp4
 

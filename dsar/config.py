@@ -113,14 +113,15 @@ class ScheduleConfig:
     steps: int = 1500
     """Updates in all."""
     minutes: float | None = None
-    """Wall-clock budget: the schedule is compressed to fit when the machine is too slow for `steps`."""
+    """Wall-clock budget, counted from the end of the first update (which compiles kernels on a new machine):
+    the schedule is compressed to fit when the machine is too slow for `steps`."""
     template_share: float = 0.12
     """Share of the updates that fit the template alone, on near-rest frames."""
     pose_share: float = 0.0
     """Share that trains the network without feedback and memory (the paper's stage 1)."""
     half_resolution_share: float = 0.75
     """Share trained on images of half the size; the template is fitted to whole ones."""
-    streams: int = 12
+    streams: int = 8
     """Rollouts that one worker advances together."""
     views: int = 1
     """Cameras rendered per rollout and rendered frame."""

@@ -69,13 +69,13 @@ def pose_fused(
     turns = nearest_quaternions(blended[..., :3])
     posed = []
     for entry, turn, transform in zip(values, turns, blended, strict=True):
-        *fields, harmonics = _Pose.apply(
+        means, rotations, scales, opacities, harmonics = _Pose.apply(
             entry, template.means, template.quaternions, template.log_scales, template.opacity_logits,
             template.harmonics, *taps, axes, transform, turn,
         )  # fmt: skip
         if harmonics.shape[1] > 1:
             harmonics = rotate_harmonics(harmonics[None], turn[None])[0]
-        posed.append(Gaussians(*fields, harmonics))
+        posed.append(Gaussians(means, rotations, scales, opacities, harmonics))
     return posed
 
 

@@ -64,9 +64,8 @@ class DualStreamNetwork(nn.Module):
 
     def hidden_weights(self) -> list[nn.Parameter]:
         """Return the convolutions' weights between the inputs and the head."""
-        named = self.named_modules()
-        convolutions = [m for _, m in named if isinstance(m, nn.Conv2d | nn.ConvTranspose2d)]
-        return [m.weight for m in convolutions if m is not self.decoder.head]
+        others = (self.identity, self.decoder.head.weight)
+        return [p for p in self.parameters() if p.ndim == 4 and not any(p is other for other in others)]
 
     def start(self, batch: int) -> NetworkState:
         """Return the state of rollouts that have seen nothing yet."""

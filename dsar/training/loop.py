@@ -62,7 +62,7 @@ class Report:
     psnr: float
     """Smoothed PSNR of training crops, dB."""
     seconds: float
-    """Seconds since this process began."""
+    """Seconds since the first update of this process."""
 
 
 Reporter = Callable[[Report], None]
@@ -124,7 +124,7 @@ def _train(config: TrainConfig, folder: Path, resume: bool, report: Reporter | N
         step, progress = at["step"], at["progress"]
         ckpt.load_optimizers(optimizers, run.checkpoint)
         trainer.carry_on(*ckpt.load_rollouts(run.checkpoint, workers.rank()))
-    resumed_at, began = progress, time.monotonic()
+    resumed_at, clock = progress, Clock(config.schedule.minutes)
     smoothed: Progress | None = None
     with _stop_signals() as received:
         while progress < 1:
@@ -133,19 +133,20 @@ def _train(config: TrainConfig, folder: Path, resume: bool, report: Reporter | N
             rng = np.random.default_rng([config.seed, workers.rank(), step])
             gradients.clear()
             done = _segment(trainer, rng, now, still, step)
-            stop, used = gradients.average(bool(received), _used(config, began))
+            stop, used = gradients.average(bool(received), clock.used())
             if not gradients.buffer.isfinite().all():
                 raise TrainingError(f"step {step}: the gradient of {bad_gradient(avatar)} is not finite")
             nn.utils.clip_grad_norm_(avatar.network.parameters(), config.schedule.clip)
             for optimizer in optimizers.values():
                 optimizer.step()
+            clock.start()
             step += 1
             progress = step / config.schedule.steps
             if config.schedule.minutes is not None:
                 progress = max(progress, resumed_at + used)
             smoothed = _smooth(smoothed, done)
             if workers.rank() == 0 and (step % REPORT_EVERY == 0 or progress >= 1):
-                _report(run, config, step, progress, now, smoothed, time.monotonic() - began, report)
+                _report(run, config, step, progress, now, smoothed, clock.seconds(), report)
             if stop or progress >= 1 or step % SAVE_EVERY == 0:
                 save(run, avatar, optimizers, trainer, step, progress)
             if stop:
@@ -203,7 +204,7 @@ def still_frames(trainer: SegmentTrainer, fps: float) -> list[tuple[str, int]]:
     return stillest_frames(tracks, fps, STILL_FRAMES, per_sequence)
 
 
-def make_optimizers(avatar: Avatar, schedule: ScheduleConfig) -> dict[str, torch.optim.Optimizer]:
+def make_optimizers(avatar: Avatar, schedule: ScheduleConfig) -> Mapping[str, torch.optim.Optimizer]:
     """Return Muon for the network's hidden convolutions and Adam for all else; rates are set each update.
 
     Adam's epsilon is far below the default: inner gradients of this network are smaller than 1e-8.
@@ -257,9 +258,24 @@ def save(
     workers.barrier()
 
 
-def _used(config: TrainConfig, began: float) -> float:
-    minutes = config.schedule.minutes
-    return 0.0 if minutes is None else (time.monotonic() - began) / (60 * minutes)
+class Clock:
+    """The time since the first update, which compiles kernels where they never ran before."""
+
+    def __init__(self, minutes: float | None) -> None:
+        self.minutes = minutes
+        self.began: float | None = None
+
+    def start(self) -> None:
+        """Begin to count, unless it has begun."""
+        self.began = self.began if self.began is not None else time.monotonic()
+
+    def seconds(self) -> float:
+        """Return the seconds counted."""
+        return 0.0 if self.began is None else time.monotonic() - self.began
+
+    def used(self) -> float:
+        """Return the share of the budget used; 0 without a budget."""
+        return 0.0 if self.minutes is None else self.seconds() / (60 * self.minutes)
 
 
 def _smooth(before: Progress | None, now: Progress) -> Progress:

@@ -53,7 +53,7 @@ def test_an_interrupted_run_resumes_to_the_same_bits(tiny_capture, tmp_path):
     step = json.loads((stopped / "checkpoint" / "progress.json").read_text())["step"]
     assert 20 <= step < 60
     finished(started(train_arguments(tiny_capture, stopped, *command, "--resume")))
-    for name in ("avatar", "optimizer", "rollouts-0", "rollouts-1"):
+    for name in ("avatar", "adam", "muon", "rollouts-0", "rollouts-1"):
         a, b = (load_file(folder / "checkpoint" / f"{name}.safetensors") for folder in (whole, stopped))
         assert a.keys() == b.keys()
         for key in a:
