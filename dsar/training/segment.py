@@ -150,7 +150,7 @@ class SegmentTrainer:
         loss = loss / count
         if not loss.isfinite():
             raise TrainingError(
-                f"the loss is {float(loss)}; first tensor that is not finite: {self._culprit()}"
+                f"the loss is {float(loss.detach())}; first tensor that is not finite: {self._culprit()}"
             )
         loss.backward()
         return Progress(float(loss.detach()), float(mse) / count)
