@@ -78,7 +78,7 @@ class SegmentTrainer:
                 view = self._views(rng, each, place.sequence, place.frame, position.reduction)
                 loss, mse, count = loss + view[0], mse + view[1], count + schedule.views
             if with_streams:
-                loss = loss + self._temporal(context, output, observed, places) * len(places) * schedule.views
+                loss = loss + self._temporal(context, output, observed, places) * len(shown) * schedule.views
             self.streams.advance()
         progress = self._finish(loss, mse, max(count, 1))
         self.state = self.state.detach()
