@@ -53,7 +53,7 @@ class ModelConfig:
     """Encoder channels, finest level first; every further level halves the resolution."""
     heads: int = 4
     """Attention heads of both attentions."""
-    upsample: int = 4
+    upsample: int = 8
     """Atlas texels per network pixel, each way (1: the paper's)."""
     identity_channels: int = 8
     """Channels of a learnt static map that tells pixels apart (extension)."""
@@ -92,8 +92,11 @@ class LossConfig:
     """1 - SSIM."""
     lpips: float = 0.0
     """LPIPS (needs its weights: tools/fetch_lpips.py)."""
-    alpha: float = 0.3
+    alpha: float = 0.6
     """Absolute difference of alpha and mask (extension)."""
+    spatial: float = 0.001
+    """Squared difference of the offsets, in cm, of neighbours on the surface (extension): colours repeat
+    in a print, so they alone pair cloth with the wrong place; cloth moves together."""
     feature: float = 0.01
     """L_feat, with the paper's gamma 0.1 at every level."""
     prediction: float = 0.1
@@ -121,11 +124,11 @@ class ScheduleConfig:
     """Share that trains the network without feedback and memory (the paper's stage 1)."""
     half_resolution_share: float = 0.75
     """Share trained on images of half the size; the template is fitted to whole ones."""
-    streams: int = 8
+    streams: int = 24
     """Rollouts that one worker advances together."""
     views: int = 1
     """Cameras rendered per rollout and rendered frame."""
-    rendered: float = 0.5
+    rendered: float = 0.33
     """Share of the frames, drawn by chance, that are rendered and compared; the network sees all."""
     segment: int = 4
     """Frames K of truncated back-propagation through time."""
@@ -199,7 +202,7 @@ PRESETS: dict[str, TrainConfig] = {
     "small": TrainConfig(
         preset="small",
         atlas=AtlasConfig(resolution=128, garment_rows=64),
-        model=ModelConfig(channels=(32, 64, 96)),
+        model=ModelConfig(channels=(32, 64, 96), upsample=4),
         schedule=ScheduleConfig(steps=20000, views=2),
     ),
     "paper": TrainConfig(
@@ -218,7 +221,7 @@ PRESETS: dict[str, TrainConfig] = {
             recall=0.1,
             appearance_scale=1.0,
         ),
-        loss=LossConfig(pyramid=1, ssim=0.2, lpips=0.5, alpha=0.0, temporal_scale=1.0),
+        loss=LossConfig(pyramid=1, ssim=0.2, lpips=0.5, alpha=0.0, spatial=0.0, temporal_scale=1.0),
         schedule=ScheduleConfig(
             steps=300_000,
             learning_rate=6e-4,

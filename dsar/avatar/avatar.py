@@ -5,10 +5,10 @@ from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
 from dsar.avatar.fused import bilinear_taps, pose_fused, sample
-from dsar.avatar.garment import fit_garment_chart
+from dsar.avatar.garment import beneath, fit_garment_chart
 from dsar.avatar.posing import pose_gaussians
 from dsar.avatar.stillness import stillest_frames
-from dsar.avatar.template import GaussianParameters
+from dsar.avatar.template import SHOWN, GaussianParameters
 from dsar.body.atlas import Atlas, body_chart
 from dsar.body.model import PARENTS, Body
 from dsar.body.skinning import forward_kinematics
@@ -31,6 +31,8 @@ class Avatar(nn.Module):
 
     texels: Tensor
     texel_weights: Tensor
+    texel_positions: Tensor
+    texel_hidden: Tensor
     cells: Tensor
     control_points: Tensor
     control_weights: Tensor
@@ -40,6 +42,7 @@ class Avatar(nn.Module):
     map_mean: Tensor
     map_scale: Tensor
     speed_scale: Tensor
+    links: Tensor
     body_joints: Tensor
     tap_cells: Tensor
     tap_weights: Tensor
@@ -54,6 +57,8 @@ class Avatar(nn.Module):
         self.register_buffer("texel_positions", atlas.positions)
         self.register_buffer("texel_weights", atlas.weights)
         self.register_buffer("texel_frames", atlas.frames)
+        self.register_buffer("texel_tangents", atlas.tangents)
+        self.register_buffer("texel_hidden", atlas.hidden)
         size = (atlas.height // model.upsample, atlas.width // model.upsample)
         cells, nearest = grid_cells(atlas, model.upsample)
         self.grid_size = size
@@ -61,6 +66,7 @@ class Avatar(nn.Module):
         self.register_buffer("control_points", atlas.positions[nearest])
         self.register_buffer("control_weights", atlas.weights[nearest])
         self.register_buffer("control_frames", atlas.frames[nearest])
+        self.register_buffer("links", surface_links(cells, size, atlas.positions[nearest]), persistent=False)
         axes = atlas.frames if model.axes == "surface" else torch.eye(3).expand_as(atlas.frames)
         self.register_buffer("texel_axes", axes.contiguous(), persistent=False)
         self.register_buffer("control_axes", axes[nearest], persistent=False)
@@ -73,7 +79,7 @@ class Avatar(nn.Module):
         self.register_buffer("speed_scale", torch.ones(()))
         occupied = torch.zeros(size[0] * size[1], dtype=torch.bool)
         occupied[cells] = True
-        self.template = GaussianParameters(atlas.positions, model.sh_degree)
+        self.template = GaussianParameters(atlas.positions, atlas.tangents, atlas.hidden, model.sh_degree)
         self.network = DualStreamNetwork(model, occupied.reshape(size))
 
     @classmethod
@@ -82,14 +88,16 @@ class Avatar(nn.Module):
         motions = {name: capture.motions[name] for name in capture.splits["train"]}
         fps = next(iter(motions.values())).fps
         tracks = {n: forward_kinematics(body, m.rotations, m.translations) for n, m in motions.items()}
-        charts = [body_chart(body, atlas.resolution)]
+        charts, hidden = [body_chart(body, atlas.resolution)], None
         if atlas.garment == "auto":
             still = stillest_frames(tracks, fps, GARMENT_FRAMES, per_sequence=3)
             pelvis = torch.stack([tracks[name][frame, 0] for name, frame in still])
             size = (atlas.garment_rows, atlas.resolution)
             chart = fit_garment_chart(body, capture, still, pelvis, size, atlas.weight_smoothing)
-            charts += [chart] if chart is not None else []
-        avatar = cls(body, Atlas.stack(charts), model, fps)
+            if chart is not None:
+                hidden = beneath(body, chart, charts[0])
+                charts.append(chart)
+        avatar = cls(body, Atlas.stack(charts, hidden), model, fps)
         avatar.measure_maps(list(tracks.values()))
         return avatar
 
@@ -150,6 +158,24 @@ class Avatar(nn.Module):
         deviation = (values - self.map_mean[:, 0]).square().mean((0, 2)).sqrt()
         self.map_scale.copy_(deviation.clamp_min(1e-3)[:, None, None])
         self.speed_scale.copy_(torch.cat(speeds).square().mean().sqrt().clamp_min(1e-3))
+
+    @torch.no_grad()
+    def reveal(self) -> None:
+        """Show the body beneath the garment in the look of the nearest bare texel; once, the template fitted.
+
+        Fitted along with the garment it would be painted like it, and when the cloth lifts, that paint
+        stays behind.
+        """
+        if not self.texel_hidden.any():
+            return
+        height, width = self.atlas_size
+        body = self.texels < min(height, width) * width
+        bare = (body & ~self.texel_hidden).nonzero().squeeze(1)
+        points = self.texel_positions
+        source = bare[torch.cdist(points[self.texel_hidden], points[bare]).argmin(1)]
+        self.template.harmonics[self.texel_hidden] = self.template.harmonics[source]
+        self.template.opacity_logits[self.texel_hidden] = SHOWN
+        self.texel_hidden.fill_(False)
 
     def advance(
         self, context: Float[Tensor, "b 3 j 4 4"], state: NetworkState, *, streams: bool = True
@@ -214,3 +240,25 @@ def grid_cells(atlas: Atlas, upsample: int) -> tuple[Int64[Tensor, " p"], Int64[
     order = (cell.double() * 1e6 + distance).argsort(stable=True)
     cells, counts = cell[order].unique_consecutive(return_counts=True)
     return cells, order[counts.cumsum(0) - counts]
+
+
+def surface_links(
+    cells: Int64[Tensor, " p"], size: tuple[int, int], points: Float[Tensor, "p 3"]
+) -> Int64[Tensor, "l 2"]:
+    """Return the pairs of control points that are neighbours on the surface.
+
+    They are neighbours on the grid, whose first column follows its last, and not much farther apart
+    than is usual: a garment chart closes to a tube, and islands of the body's UV map stay apart.
+    """
+    height, width = size
+    index = torch.full((height * width,), -1)
+    index[cells] = torch.arange(len(cells))
+    grid = index.reshape(size)
+    pairs = [
+        torch.stack([grid, grid.roll(-1, 1)], -1).reshape(-1, 2),
+        torch.stack([grid[:-1], grid[1:]], -1).reshape(-1, 2),
+    ]
+    links = torch.cat(pairs)
+    links = links[(links >= 0).all(1)]
+    distance = (points[links[:, 0]] - points[links[:, 1]]).norm(dim=1)
+    return links[distance <= 2 * distance.median()]

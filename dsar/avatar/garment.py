@@ -28,6 +28,8 @@ REACH = 0.7
 """Metres from the body's axis that the search covers."""
 AZIMUTHS = 64
 """Directions sampled around the axis."""
+BELOW_HEM = 0.03
+"""Metres below the hem that still count as beneath the garment: cameras above the hem do not see them."""
 _ARMS = ("collar", "shoulder", "elbow", "wrist", "index", "middle", "pinky", "ring", "thumb")
 
 
@@ -52,7 +54,8 @@ def fit_garment_chart(
         LOGGER.info("no loose garment found: the atlas is the body's alone")
         return None
     hem, waist = extent
-    rows = torch.linspace(waist, hem, size[0])
+    # The masks of all cameras agree on a little less than the cloth: its border must not be left to the legs.
+    rows = torch.linspace(waist, hem - 2 * STEP, size[0])
     azimuths = _azimuths(size[1])
     # Near the hem the masks' border frays the hull; the cloth goes straight on there.
     radii = _resample(hull, heights, rows.clamp_min(hem + 4 * STEP), size[1])
@@ -64,7 +67,29 @@ def fit_garment_chart(
     )
     weights = diffuse_weights(body, positions, smoothing)
     axes = surface_frames(directions.repeat(size[0], 1))
-    return Chart(torch.ones(size, dtype=torch.bool), positions, weights, axes)
+    tangents = tube_tangents(positions.unflatten(0, size))
+    return Chart(torch.ones(size, dtype=torch.bool), positions, weights, axes, tangents)
+
+
+def tube_tangents(positions: Float[Tensor, "r c 3"]) -> Float[Tensor, "n 3 2"]:
+    """Return a tube's displacement for one texel to the right, where columns close, and for one down."""
+    right = (positions.roll(-1, 1) - positions.roll(1, 1)) / 2
+    down = torch.gradient(positions, dim=0)[0]
+    return torch.stack([right, down], -1).flatten(0, 1)
+
+
+def beneath(body: Body, chart: Chart, points: Chart) -> Bool[Tensor, " n"]:
+    """Return which texels of the body's chart lie inside a garment's tube at rest; arms never do."""
+    center = body.joints[0]
+    offset, tube = points.positions - center, (chart.positions - center).unflatten(0, chart.covered.shape)
+    rows, columns = chart.covered.shape
+    waist, hem = tube[0, 0, 1], tube[-1, 0, 1]
+    row = ((waist - offset[:, 1]) / (waist - hem) * (rows - 1)).round().long().clamp(0, rows - 1)
+    azimuth = torch.atan2(offset[:, 0], offset[:, 2])
+    column = ((azimuth + math.pi) / (2 * math.pi) * columns).long().clamp(0, columns - 1)
+    inside = offset[:, [0, 2]].norm(dim=1) < tube[row, column][:, [0, 2]].norm(dim=1)
+    level = (offset[:, 1] <= waist) & (offset[:, 1] >= hem - BELOW_HEM)
+    return inside & level & (points.weights[:, _arm_joints()].sum(1) < 0.5)
 
 
 def hull_radii(
@@ -144,8 +169,11 @@ def diffuse_weights(body: Body, points: Float[Tensor, "n 3"], sigma: float) -> F
 
 
 def _is_arm(body: Body) -> Bool[Tensor, " v"]:
-    arm = torch.tensor([any(part in name for part in _ARMS) for name in JOINT_NAMES])
-    return body.weights[:, arm].sum(1) > 0.5
+    return body.weights[:, _arm_joints()].sum(1) > 0.5
+
+
+def _arm_joints() -> Bool[Tensor, " j"]:
+    return torch.tensor([any(part in name for part in _ARMS) for name in JOINT_NAMES])
 
 
 def _chest(body: Body) -> float:

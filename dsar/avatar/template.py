@@ -1,26 +1,43 @@
 """The learnable template: raw parameters of the canonical Gaussians (paper section 3.1)."""
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from dsar.geometry.harmonics import dc_from_color
+from dsar.geometry.rotations import quaternion_from_matrix
 
 SCALE_RANGE = (2e-4, 0.1)
 """Standard deviations are kept within these metres."""
+SPREAD = 0.5
+"""First standard deviations in texels: neighbours overlap without blurring each other."""
+SHOWN, HIDDEN = 2.0, -8.0
+"""First logits of opacity."""
+THICKNESS = 0.3
+"""First thickness as a share of the shorter side."""
 
 
 class GaussianParameters(nn.Module):
     """Raw, unbounded values; `activate` is the only way to physical ones."""
 
-    def __init__(self, positions: Float[Tensor, "n 3"], sh_degree: int) -> None:
+    def __init__(
+        self,
+        positions: Float[Tensor, "n 3"],
+        tangents: Float[Tensor, "n 3 2"],
+        hidden: Bool[Tensor, " n"],
+        sh_degree: int,
+    ) -> None:
+        """Start grey, one Gaussian as large and as flat as its texel (see `Chart.tangents`).
+
+        Those that are `hidden` are too transparent to be drawn, and so get no gradient.
+        """
         super().__init__()
         n = len(positions)
         self.means = nn.Parameter(positions.clone())
-        self.quaternions = nn.Parameter(torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(n, 1))
-        spacing = nearest_distances(positions).clamp(*SCALE_RANGE)
-        self.log_scales = nn.Parameter(spacing.log()[:, None].repeat(1, 3))
-        self.opacity_logits = nn.Parameter(torch.full((n,), 2.0))
+        rotations, scales = footprint(tangents)
+        self.quaternions = nn.Parameter(rotations)
+        self.log_scales = nn.Parameter(scales.log())
+        self.opacity_logits = nn.Parameter(torch.where(hidden, HIDDEN, SHOWN))
         harmonics = torch.zeros(n, (sh_degree + 1) ** 2, 3)
         harmonics[:, 0] = dc_from_color(torch.tensor([0.5, 0.5, 0.5]))
         self.harmonics = nn.Parameter(harmonics)
@@ -47,10 +64,22 @@ class GaussianParameters(nn.Module):
         return means, rotations, log_scales.exp().clamp(*SCALE_RANGE), logits.sigmoid(), harmonics
 
 
-def nearest_distances(points: Float[Tensor, "n 3"], neighbours: int = 6) -> Float[Tensor, " n"]:
-    """Return the mean distance of each point to its nearest neighbours, metres."""
-    rows = []
-    for chunk in points.split(1024):
-        distances = torch.cdist(chunk, points).topk(neighbours + 1, largest=False).values
-        rows.append(distances[:, 1:].mean(1))
-    return torch.cat(rows)
+def footprint(
+    tangents: Float[Tensor, "n 3 2"],
+) -> tuple[Float[Tensor, "n 4"], Float[Tensor, "n 3"]]:
+    """Return rotations (wxyz) and standard deviations that make each Gaussian its texel's footprint.
+
+    The singular directions of the texel's sides are the first two axes, so that a stretched texel is
+    covered from end to end, named and signed after the sides they follow, so that neighbours agree; the
+    third is the normal, THICKNESS times as wide as the shorter side.
+    """
+    directions, sides, _ = torch.linalg.svd(tangents, full_matrices=False)
+    along = (directions.mT @ tangents).abs()
+    crossed = along[:, 0, 0] * along[:, 1, 1] < along[:, 0, 1] * along[:, 1, 0]
+    directions = torch.where(crossed[:, None, None], directions.flip(-1), directions)
+    sides = torch.where(crossed[:, None], sides.flip(-1), sides)
+    directions = directions * torch.where((directions * tangents).sum(1, keepdim=True) < 0, -1, 1)
+    normals = torch.linalg.cross(directions[..., 0], directions[..., 1])
+    axes = torch.cat([directions, normals[..., None]], -1)
+    scales = SPREAD * torch.cat([sides, THICKNESS * sides.amin(1, keepdim=True)], 1)
+    return quaternion_from_matrix(axes), scales.clamp(*SCALE_RANGE)

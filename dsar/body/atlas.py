@@ -27,6 +27,8 @@ class Chart:
     """Skin weights of the covered texels; rows sum to 1."""
     frames: Float[Tensor, "n 3 3"]
     """Rest axes of the surface at each texel, as columns: side, up along the surface, outward normal."""
+    tangents: Float[Tensor, "n 3 2"]
+    """Rest displacement in metres, as columns, for one texel to the right and for one down."""
 
 
 @dataclass(frozen=True)
@@ -45,14 +47,22 @@ class Atlas:
     """Skin weights of each texel."""
     frames: Float[Tensor, "n 3 3"]
     """Rest axes of the surface at each texel (see `Chart`)."""
+    tangents: Float[Tensor, "n 3 2"]
+    """Rest displacement of one texel's step along each side (see `Chart`)."""
+    hidden: Bool[Tensor, " n"]
+    """Texels of the body beneath a garment chart: no camera sees them at rest."""
 
     def __len__(self) -> int:
         """Return the number of Gaussians."""
         return len(self.texels)
 
     @classmethod
-    def stack(cls, charts: list[Chart]) -> "Atlas":
-        """Stack charts of equal width."""
+    def stack(cls, charts: list[Chart], hidden: Bool[Tensor, " b"] | None = None) -> "Atlas":
+        """Stack charts of equal width; `hidden` marks texels of the first one, none where it is left out."""
+        count = sum(len(chart.positions) for chart in charts)
+        marked = torch.zeros(count, dtype=torch.bool)
+        if hidden is not None:
+            marked[: len(hidden)] = hidden
         covered = torch.cat([chart.covered for chart in charts])
         return cls(
             height=covered.shape[0],
@@ -61,6 +71,8 @@ class Atlas:
             positions=torch.cat([chart.positions for chart in charts]),
             weights=torch.cat([chart.weights for chart in charts]),
             frames=torch.cat([chart.frames for chart in charts]),
+            tangents=torch.cat([chart.tangents for chart in charts]),
+            hidden=marked,
         )
 
 
@@ -88,7 +100,23 @@ def body_chart(body: Body, resolution: int, smoothing_rounds: int = 0) -> Chart:
         positions=torch.einsum("nk,nkc->nc", mix, body.vertices[corners]),
         weights=torch.einsum("nk,nkj->nj", mix, weights[corners]),
         frames=surface_frames(torch.einsum("nk,nkc->nc", mix, vertex_normals(body)[corners])),
+        tangents=uv_tangents(body, resolution)[faces[covered]],
     )
+
+
+def uv_tangents(body: Body, resolution: int) -> Float[Tensor, "f 3 2"]:
+    """Return each face's displacement in metres for one texel to the right and one down its UV map.
+
+    Faces that the UV map folds to nothing get zero; no texel's centre lies in them.
+    """
+    corners = body.vertices[body.faces].double()
+    uv = body.uv[body.uv_faces].double() * torch.tensor([resolution, -resolution])
+    edges = (corners[:, 1:] - corners[:, :1]).transpose(1, 2)
+    texels = (uv[:, 1:] - uv[:, :1]).transpose(1, 2)
+    flat = torch.linalg.det(texels).abs() < 1e-12
+    texels[flat] = torch.eye(2, dtype=texels.dtype)
+    edges[flat] = 0
+    return torch.linalg.solve(texels, edges, left=False).float()
 
 
 def vertex_normals(body: Body) -> Float[Tensor, "v 3"]:

@@ -85,8 +85,8 @@ def load_checkpoint(run: Run) -> tuple[Avatar, TrainConfig, dict[str, str]]:
     tensors = load_file(path)
     body = Body(parents=PARENTS, **{name: tensors[f"body_{name}"] for name in _BODY})
     height, width = (int(size) for size in tensors.pop("atlas_size"))
-    fields = (tensors[name] for name in ("texels", "texel_positions", "texel_weights", "texel_frames"))
-    atlas = Atlas(height, width, *fields)
+    fields = ("positions", "weights", "frames", "tangents", "hidden")
+    atlas = Atlas(height, width, tensors["texels"], *(tensors[f"texel_{name}"] for name in fields))
     avatar = Avatar(body, atlas, config.model, float(tensors.pop("fps")))
     avatar.load_state_dict(tensors)
     digest = hashlib.sha256(path.read_bytes()).hexdigest()[:16]

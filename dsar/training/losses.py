@@ -90,6 +90,14 @@ def image_loss(
     return loss, (output.color - truth).detach().square().mean()
 
 
+def spatial_loss(
+    offset: Float[Tensor, "b 3 h w"], cells: Int64[Tensor, " p"], links: Int64[Tensor, "l 2"]
+) -> Float[Tensor, ""]:
+    """Return the mean squared difference, cm, of the offsets of linked control points (flat `cells`)."""
+    offsets = offset.flatten(2)[:, :, cells] * _CENTIMETRES
+    return (offsets[:, :, links[:, 0]] - offsets[:, :, links[:, 1]]).square().sum(1).mean()
+
+
 @dataclass(frozen=True)
 class TemporalRecord:
     """What the temporal losses remember of one frame of a batch of rollouts."""

@@ -13,7 +13,7 @@ from dsar.errors import TrainingError
 from dsar.network import NetworkOutput, NetworkState
 from dsar.network.maps import FrameMaps
 from dsar.raster import rasterize, reduced_dilation
-from dsar.training.losses import TemporalRecord, image_loss, temporal_loss
+from dsar.training.losses import TemporalRecord, image_loss, spatial_loss, temporal_loss
 from dsar.training.stages import Position
 from dsar.training.streams import Stream, Streams
 from dsar.training.targets import load_target
@@ -77,8 +77,10 @@ class SegmentTrainer:
             for place, each in zip((places[i] for i in shown), gaussians, strict=True):
                 view = self._views(rng, each, place.sequence, place.frame, position.reduction)
                 loss, mse, count = loss + view[0], mse + view[1], count + schedule.views
+            regularisers = self._spatial(output)
             if with_streams:
-                loss = loss + self._temporal(context, output, observed, places) * len(shown) * schedule.views
+                regularisers = regularisers + self._temporal(context, output, observed, places)
+            loss = loss + regularisers * len(shown) * schedule.views
             self.streams.advance()
         progress = self._finish(loss, mse, max(count, 1))
         self.state = self.state.detach()
@@ -133,6 +135,9 @@ class SegmentTrainer:
             one, error = image_loss(output, target, background, self.config.loss, self.lpips)
             loss, mse = loss + one, mse + error
         return loss, mse
+
+    def _spatial(self, output: NetworkOutput) -> Tensor:
+        return self.config.loss.spatial * spatial_loss(output.offset, self.avatar.cells, self.avatar.links)
 
     def _temporal(
         self, context: Tensor, output: NetworkOutput, observed: FrameMaps, places: list[Stream]

@@ -41,6 +41,48 @@ def test_the_chart_spans_the_true_skirt_at_rest(capture, avatar):
     assert np.median(nearest) < 0.03
 
 
+def test_links_close_the_tube_and_join_neither_charts_nor_islands(avatar):
+    columns, rows = avatar.grid_size[1], AtlasConfig().garment_rows // avatar.model.upsample
+    row, column = avatar.cells // columns, avatar.cells % columns
+    garment = row >= avatar.grid_size[0] - rows
+    a, b = avatar.links.T
+    assert torch.equal(garment[a], garment[b])
+    seam = garment[a] & ((column[a] - column[b]).abs() == columns - 1)
+    assert seam.sum() == rows
+    # Around and down: every cell of the tube has its right neighbour and all but the last row the lower one.
+    assert garment[a].sum() == rows * columns + (rows - 1) * columns
+    step = (avatar.control_points[a] - avatar.control_points[b]).norm(dim=1)
+    assert step.max() <= 2 * step.median() * 1.3
+
+
+def test_the_body_beneath_is_hidden_at_first_then_looks_like_bare_skin(capture):
+    torch.manual_seed(0)
+    config = TrainConfig()
+    avatar = Avatar.from_capture(capture, capture.body, config.atlas, config.model)
+    hidden, template = avatar.texel_hidden.clone(), avatar.template
+    body = avatar.texels < config.atlas.resolution**2
+    heights = avatar.texel_positions[:, 1]
+    assert 500 < hidden.sum() < 0.3 * body.sum()
+    assert body[hidden].all()
+    assert heights[hidden].min() > heights[~body].min() - 0.04
+    assert heights[hidden].max() < heights[~body].max() + 0.01
+    assert not hidden[avatar.texel_positions[:, 0].abs() > 0.35].any(), "an arm is hidden"
+    assert template.opacity_logits[hidden].sigmoid().max() < 1 / 255
+    with torch.no_grad():
+        template.harmonics.copy_(torch.rand(avatar.num_gaussians, 1, 3))
+    before = template.harmonics.detach().clone()
+    avatar.reveal()
+    assert torch.equal(template.harmonics[~hidden], before[~hidden])
+    shown = template.harmonics[hidden][:, 0].detach()
+    bare = before[body & ~hidden][:, 0]
+    assert set(map(tuple, shown.tolist())) <= set(map(tuple, bare.tolist()))
+    assert torch.equal(template.opacity_logits[hidden], template.opacity_logits[~hidden][: hidden.sum()])
+    with torch.no_grad():
+        template.harmonics.zero_()
+    avatar.reveal()
+    assert not template.harmonics.any(), "what has been learnt since was thrown away"
+
+
 def test_a_tight_figure_gets_no_chart():
     heights = torch.linspace(-0.7, 0.3, 81)
     assert loose_extent(heights, torch.full((81,), 0.02)) is None
@@ -60,6 +102,7 @@ def test_one_fitted_frame_covers_the_mask(capture, sequence, frame):
     torch.manual_seed(0)
     config = TrainConfig()
     avatar = Avatar.from_capture(capture, capture.body, config.atlas, config.model).train()
+    avatar.reveal()
     trainer = SegmentTrainer(config, capture, avatar, {sequence: range(frame + 1)}, None)
     optimizers = loop.make_optimizers(avatar, config.schedule)
     gradients = Gradients(list(avatar.parameters()))

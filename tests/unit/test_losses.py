@@ -8,7 +8,14 @@ from scipy.ndimage import gaussian_filter
 from dsar.config import LossConfig
 from dsar.network import NetworkOutput
 from dsar.training.fused_loss import fused_image_loss
-from dsar.training.losses import TemporalRecord, plain_image_loss, pyramid_l1, ssim, temporal_loss
+from dsar.training.losses import (
+    TemporalRecord,
+    plain_image_loss,
+    pyramid_l1,
+    spatial_loss,
+    ssim,
+    temporal_loss,
+)
 
 
 def images(seed=0, size=(40, 33)):
@@ -55,6 +62,18 @@ def loss(records, ages, **weights):
         **({"feature": 0.0, "prediction": 0.0, "smoothness": 0.0, "temporal_scale": 1.0} | weights)
     )
     return float(temporal_loss(records, ages, torch.ones(1, 1, 2, 2), torch.arange(4), config))
+
+
+def test_spatial_loss_counts_a_centimetre_between_neighbours_as_one():
+    offset = torch.zeros(2, 3, 2, 2)
+    cells, links = torch.tensor([0, 1, 3]), torch.tensor([[0, 1], [1, 2]])
+    offset[:] = 0.2
+    assert spatial_loss(offset, cells, links) == 0
+    offset[0, 1, 0, 0] += 0.01
+    # One link of two, in one rollout of two.
+    assert abs(float(spatial_loss(offset, cells, links)) - 0.25) < 1e-5
+    offset[:, :, 1, 0] = 9.0
+    assert abs(float(spatial_loss(offset, cells, links)) - 0.25) < 1e-5, "an empty cell counts"
 
 
 def test_prediction_loss_counts_a_centimetre_as_one():

@@ -24,7 +24,9 @@ def test_kernel_finds_the_polar_factor_of_blended_bones():
 
 def test_a_rigid_move_carries_means_covariances_and_radiance():
     torch.manual_seed(0)
-    template = GaussianParameters(torch.randn(20, 3), sh_degree=1)
+    template = GaussianParameters(
+        torch.randn(20, 3), torch.randn(20, 3, 2), torch.zeros(20, dtype=torch.bool), sh_degree=1
+    )
     with torch.no_grad():
         template.log_scales.add_(torch.randn(20, 3))
         template.quaternions.add_(torch.randn(20, 4))
@@ -52,7 +54,7 @@ def test_fused_posing_equals_sampling_activation_and_posing_in_turn(degree):
         return torch.randn(*shape, generator=generator)
 
     n, channels = 60, 8 + 3 * (degree + 1) ** 2
-    template = GaussianParameters(random(n, 3), degree)
+    template = GaussianParameters(random(n, 3), random(n, 3, 2), torch.zeros(n, dtype=torch.bool), degree)
     with torch.no_grad():
         for parameter in template.parameters():
             parameter.add_(0.5 * random(*parameter.shape))
