@@ -168,8 +168,8 @@ class Avatar(nn.Module):
         """
         if not self.texel_hidden.any():
             return
-        height, width = self.atlas_size
-        body = self.texels < min(height, width) * width
+        # The body's square is the first chart of the atlas.
+        body = self.texels < self.atlas_size[1] ** 2
         bare = (body & ~self.texel_hidden).nonzero().squeeze(1)
         points = self.texel_positions
         source = bare[torch.cdist(points[self.texel_hidden], points[bare]).argmin(1)]

@@ -130,8 +130,6 @@ def _train(config: TrainConfig, folder: Path, resume: bool, report: Reporter | N
         while progress < 1:
             now = position(config.schedule, progress)
             set_rates(optimizers, now)
-            if now.stage != "template":
-                avatar.reveal()
             rng = np.random.default_rng([config.seed, workers.rank(), step])
             gradients.clear()
             done = _segment(trainer, rng, now, still, step)

@@ -64,7 +64,8 @@ class SegmentTrainer:
         return self._finish(loss, mse, TEMPLATE_FRAMES * self.config.schedule.views)
 
     def segment(self, rng: np.random.Generator, position: Position) -> Progress:
-        """Advance every rollout by K frames and back-propagate through them."""
+        """Advance every rollout by K frames and back-propagate through them, the whole body shown."""
+        self.avatar.reveal()
         schedule, with_streams = self.config.schedule, position.stage == "autoregressive"
         loss, mse, count = torch.zeros(()), torch.zeros(()), 0
         for _ in range(schedule.segment):

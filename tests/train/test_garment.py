@@ -83,6 +83,22 @@ def test_the_body_beneath_is_hidden_at_first_then_looks_like_bare_skin(capture):
     assert not template.harmonics.any(), "what has been learnt since was thrown away"
 
 
+def test_the_network_trains_with_the_whole_body_the_template_without_what_is_beneath(capture):
+    torch.manual_seed(0)
+    config = TrainConfig()
+    avatar = Avatar.from_capture(capture, capture.body, config.atlas, config.model).train()
+    trainer = SegmentTrainer(config, capture, avatar, {"sway": range(3)}, None)
+    hidden = avatar.texel_hidden.clone()
+    Gradients(list(avatar.parameters())).clear()
+    trainer.template_segment(np.random.default_rng(0), [("sway", 0)], 2)
+    for name, parameter in avatar.template.named_parameters():
+        assert parameter.grad[~hidden].any(), name
+        assert not parameter.grad[hidden].any(), name
+    trainer.segment(np.random.default_rng(0), Position("autoregressive", 9, 2, 0.0, 0.0, 0.0))
+    assert not avatar.texel_hidden.any()
+    assert avatar.template.opacity_logits[hidden].min() > 0
+
+
 def test_a_tight_figure_gets_no_chart():
     heights = torch.linspace(-0.7, 0.3, 81)
     assert loose_extent(heights, torch.full((81,), 0.02)) is None

@@ -60,8 +60,10 @@ def test_contradictory_settings_are_refused_before_any_work():
     import dataclasses
 
     config = TrainConfig()
-    with pytest.raises(ConfigError, match="multiple of 32"):
-        dataclasses.replace(config, atlas=dataclasses.replace(config.atlas, resolution=100)).validate()
+    atlas = dataclasses.replace(config.atlas, resolution=100)
+    model = dataclasses.replace(config.model, upsample=4)
+    with pytest.raises(ConfigError, match="multiple of 16"):
+        dataclasses.replace(config, atlas=atlas, model=model).validate()
     with pytest.raises(ConfigError, match="heads"):
         dataclasses.replace(config, model=dataclasses.replace(config.model, heads=5)).validate()
 
