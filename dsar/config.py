@@ -97,6 +97,8 @@ class LossConfig:
     spatial: float = 0.001
     """Squared difference of the offsets, in cm, of neighbours on the surface (extension): colours repeat
     in a print, so they alone pair cloth with the wrong place; cloth moves together."""
+    registered: float = 0.04
+    """Distance in cm to the registered maps while images are compared (extension)."""
     feature: float = 0.01
     """L_feat, with the paper's gamma 0.1 at every level."""
     prediction: float = 0.1
@@ -120,9 +122,12 @@ class ScheduleConfig:
     the schedule is compressed to fit when the machine is too slow for `steps`."""
     template_share: float = 0.12
     """Share of the updates that fit the template alone, on near-rest frames."""
+    imitation_share: float = 0.2
+    """Share of the updates that teach the network registered maps, without images; 0: no registration (the
+    paper's). Registration itself takes no updates, but its time is part of the budget."""
     pose_share: float = 0.0
     """Share that trains the network without feedback and memory (the paper's stage 1)."""
-    half_resolution_share: float = 0.75
+    half_resolution_share: float = 0.85
     """Share trained on images of half the size; the template is fitted to whole ones."""
     streams: int = 24
     """Rollouts that one worker advances together."""
@@ -132,6 +137,9 @@ class ScheduleConfig:
     """Share of the frames, drawn by chance, that are rendered and compared; the network sees all."""
     segment: int = 4
     """Frames K of truncated back-propagation through time."""
+    mirrored: float = 0.5
+    """Share of the rollouts that see the mirrored motion (extension): the network learns from twice the
+    motions; body and cloth must be cut symmetrically, their looks need not be."""
     horizon: int = 0
     """Frames after which a rollout restarts when feedback begins; it doubles until clips are whole.
     0: whole clips from the start (a rollout that starts cold in mid-motion teaches the wrong thing)."""
@@ -144,6 +152,8 @@ class ScheduleConfig:
     """Share of the network's training in which its rates rise from zero."""
     template_rate: float = 0.02
     """Factor on the template's rates once the network trains."""
+    refinement: float = 0.75
+    """Factor on the network's rates after imitation."""
     clip: float = 1.0
     """Largest norm of the network's gradient."""
 
@@ -221,14 +231,18 @@ PRESETS: dict[str, TrainConfig] = {
             recall=0.1,
             appearance_scale=1.0,
         ),
-        loss=LossConfig(pyramid=1, ssim=0.2, lpips=0.5, alpha=0.0, spatial=0.0, temporal_scale=1.0),
+        loss=LossConfig(
+            pyramid=1, ssim=0.2, lpips=0.5, alpha=0.0, spatial=0.0, registered=0.0, temporal_scale=1.0
+        ),
         schedule=ScheduleConfig(
             steps=300_000,
             learning_rate=6e-4,
             half_resolution_share=0.0,
             streams=1,
             rendered=1.0,
+            imitation_share=0.0,
             pose_share=0.15,
+            mirrored=0.0,
             horizon=16,
             matrix_rate=0.0,
         ),

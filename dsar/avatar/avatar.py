@@ -1,11 +1,12 @@
 """The avatar: template, network and skeleton; one step of it makes one frame of posed Gaussians."""
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 
 from dsar.avatar.fused import bilinear_taps, pose_fused, sample
 from dsar.avatar.garment import beneath, fit_garment_chart
+from dsar.avatar.mirror import mirror_cells, mirror_output
 from dsar.avatar.posing import pose_gaussians
 from dsar.avatar.stillness import stillest_frames
 from dsar.avatar.template import SHOWN, GaussianParameters
@@ -70,6 +71,7 @@ class Avatar(nn.Module):
         axes = atlas.frames if model.axes == "surface" else torch.eye(3).expand_as(atlas.frames)
         self.register_buffer("texel_axes", axes.contiguous(), persistent=False)
         self.register_buffer("control_axes", axes[nearest], persistent=False)
+        self.mirror = mirror_cells(self.control_points, self.control_axes)
         rows, columns = atlas.texels // atlas.width, atlas.texels % atlas.width
         taps = bilinear_taps(rows, columns, model.upsample, size)
         self.register_buffer("tap_cells", taps[0], persistent=False)
@@ -159,6 +161,12 @@ class Avatar(nn.Module):
         self.map_scale.copy_(deviation.clamp_min(1e-3)[:, None, None])
         self.speed_scale.copy_(torch.cat(speeds).square().mean().sqrt().clamp_min(1e-3))
 
+    def garment_points(self) -> Int64[Tensor, " g"]:
+        """Return which control points lie on the garment's chart; none where there is no such chart."""
+        # The body's square is the first chart of the atlas.
+        rows = self.cells // self.grid_size[1] * self.model.upsample
+        return (rows >= self.atlas_size[1]).nonzero().squeeze(1)
+
     @torch.no_grad()
     def reveal(self) -> None:
         """Show the body beneath the garment in the look of the nearest bare texel; once, the template fitted.
@@ -181,10 +189,24 @@ class Avatar(nn.Module):
         self, context: Float[Tensor, "b 3 j 4 4"], state: NetworkState, *, streams: bool = True
     ) -> tuple[NetworkOutput, NetworkState, FrameMaps]:
         """Run the network one frame on; return its output, the next state and the maps it saw."""
+        maps, speed, observed = self.see(context)
+        output, state = self.network(maps, speed, state, streams=streams)
+        return output, state, observed
+
+    def see(
+        self, context: Float[Tensor, "b 3 j 4 4"]
+    ) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 1 h w"], FrameMaps]:
+        """Return standardised maps and motion magnitude for the network, and the maps in metres."""
         observed = self.maps(context, self.fps)
         maps = (observed.maps - self.map_mean) / self.map_scale * self.network.occupied
-        output, state = self.network(maps, observed.speed / self.speed_scale, state, streams=streams)
-        return output, state, observed
+        return maps, observed.speed / self.speed_scale, observed
+
+    def unmirror(self, output: NetworkOutput, which: Bool[Tensor, " b"]) -> NetworkOutput:
+        """Turn the answers of some rollouts, given to mirrored motions, into those to the motions."""
+        other = mirror_output(output, self.cells, self.mirror)
+        where = which[:, None, None, None]
+        offset = torch.where(where, other.offset, output.offset)
+        return NetworkOutput(offset, torch.where(where, other.appearance, output.appearance), output.features)
 
     def gaussians(self, context: Float[Tensor, "b 3 j 4 4"], output: NetworkOutput | None) -> list[Gaussians]:
         """Return the posed Gaussians of each batch entry; without an output, the template's."""

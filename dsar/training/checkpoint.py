@@ -142,6 +142,16 @@ def load_rollouts(folder: Path, rank: int) -> tuple[dict[str, Tensor], Any]:
     return load_file(path), json.loads((folder / f"rollouts-{rank}.json").read_text())
 
 
+def save_registration(folder: Path, rank: int, tensors: Mapping[str, Tensor]) -> None:
+    """Write one worker's registered maps."""
+    save_file(dict(tensors), folder / f"registration-{rank}.safetensors")
+
+
+def load_registration(folder: Path, rank: int) -> dict[str, Tensor]:
+    """Restore what `save_registration` wrote."""
+    return load_file(folder / f"registration-{rank}.safetensors")
+
+
 def save_progress(folder: Path, step: int, progress: float) -> None:
     """Write where the run stands; written last, it marks a checkpoint as complete."""
     content = {"format_version": FORMAT_VERSION, "step": step, "progress": progress}

@@ -24,8 +24,10 @@ from dsar.errors import CaptureError, CheckpointError, ConfigError, TrainingErro
 from dsar.training import checkpoint as ckpt
 from dsar.training import workers
 from dsar.training.checkpoint import Run
+from dsar.training.imitation import Imitation
 from dsar.training.lpips import load_lpips
 from dsar.training.muon import Muon
+from dsar.training.registration import Registration
 from dsar.training.segment import Progress, SegmentTrainer
 from dsar.training.stages import Position, position
 from dsar.types import Capture
@@ -115,7 +117,9 @@ def _train(config: TrainConfig, folder: Path, resume: bool, report: Reporter | N
         avatar = Avatar.from_capture(capture, body, config.atlas, config.model)
     lpips = load_lpips("alex") if config.loss.lpips else None
     trainer = SegmentTrainer(config, capture, avatar.train(), training_clips(config, capture), lpips)
-    still = still_frames(trainer, avatar.fps)
+    registration = Registration(config, capture, avatar, trainer.tracks, trainer.streams.clips)
+    lessons = Lessons(config, trainer, registration)
+    schedule = registration.reduced(config.schedule)
     optimizers = make_optimizers(avatar, config.schedule)
     gradients = workers.Gradients(list(avatar.parameters()))
     step, progress = 0, 0.0
@@ -124,16 +128,25 @@ def _train(config: TrainConfig, folder: Path, resume: bool, report: Reporter | N
         step, progress = at["step"], at["progress"]
         ckpt.load_optimizers(optimizers, run.checkpoint)
         trainer.carry_on(*ckpt.load_rollouts(run.checkpoint, workers.rank()))
-    resumed_at, clock = progress, Clock(config.schedule.minutes)
+        registration.carry_on(ckpt.load_registration(run.checkpoint, workers.rank()))
+    clock, used, stop = Clock(schedule.minutes), 0.0, False
     smoothed: Progress | None = None
     with _stop_signals() as received:
         while progress < 1:
-            now = position(config.schedule, progress)
+            if stop:
+                save(run, avatar, optimizers, trainer, registration, step, progress)
+                _leave(received)
+                return
+            now = position(schedule, progress)
+            if now.stage != "template" and not registration.complete:
+                line = Report(step, schedule.steps, progress, "registration", 0.0, 0.0, 0.0)
+                stop, used = _register(registration, gradients, received, clock, line, report)
+                continue
             set_rates(optimizers, now)
             rng = np.random.default_rng([config.seed, workers.rank(), step])
             gradients.clear()
-            done = _segment(trainer, rng, now, still, step)
-            stop, used = gradients.average(bool(received), clock.used())
+            done = _segment(lessons, rng, now, step)
+            before, (stop, used) = used, gradients.average(bool(received), clock.used())
             if not gradients.buffer.isfinite().all():
                 raise TrainingError(f"step {step}: the gradient of {bad_gradient(avatar)} is not finite")
             nn.utils.clip_grad_norm_(avatar.network.parameters(), config.schedule.clip)
@@ -141,26 +154,64 @@ def _train(config: TrainConfig, folder: Path, resume: bool, report: Reporter | N
                 optimizer.step()
             clock.start()
             step += 1
-            progress = step / config.schedule.steps
-            if config.schedule.minutes is not None:
-                progress = max(progress, resumed_at + used)
+            progress = max(step / schedule.steps, progress + (used - before) * registration.haste)
             smoothed = _smooth(smoothed, done)
             if workers.rank() == 0 and (step % REPORT_EVERY == 0 or progress >= 1):
                 _report(run, config, step, progress, now, smoothed, clock.seconds(), report)
-            if stop or progress >= 1 or step % SAVE_EVERY == 0:
-                save(run, avatar, optimizers, trainer, step, progress)
-            if stop:
-                _leave(received)
-                return
+            if progress >= 1 or step % SAVE_EVERY == 0:
+                save(run, avatar, optimizers, trainer, registration, step, progress)
 
 
-def _segment(
-    trainer: SegmentTrainer, rng: np.random.Generator, now: Position, still: list[tuple[str, int]], step: int
-) -> Progress:
-    try:
+def _register(
+    registration: Registration,
+    gradients: workers.Gradients,
+    received: list[int],
+    clock: "Clock",
+    line: Report,
+    report: Reporter | None,
+) -> tuple[bool, float]:
+    """Fit the registered maps; return whether a stop came before the last, and the time used so far."""
+    began = registration.used - clock.used()
+    registration.avatar.reveal()
+    stop, used = False, 0.0
+    while not (stop or registration.complete):
+        done = registration.advance()
+        gradients.clear()
+        stop, used = gradients.average(bool(received), clock.used())
+        registration.used = began + used
+        if report is not None and done is not None and registration.count % REPORT_EVERY == 0:
+            now = {"loss": done.loss, "psnr": _psnr(done.mse), "seconds": clock.seconds()}
+            report(dataclasses.replace(line, **now))
+    if registration.complete:
+        registration.share()
+    return stop, used
+
+
+class Lessons:
+    """What each stage does in one update."""
+
+    def __init__(self, config: TrainConfig, trainer: SegmentTrainer, registration: Registration) -> None:
+        self.config, self.trainer, self.registration = config, trainer, registration
+        self.still = still_frames(trainer, trainer.avatar.fps)
+        self._imitation: Imitation | None = None
+
+    def segment(self, rng: np.random.Generator, now: Position) -> Progress:
+        """Compute the gradients of one update."""
+        trainer = self.trainer
         if now.stage == "template":
-            return trainer.template_segment(rng, still, now.reduction)
+            return trainer.template_segment(rng, self.still, now.reduction)
+        trainer.registered = self.registration.result
+        if now.stage == "imitation":
+            if self._imitation is None:
+                self._imitation = Imitation(self.config, trainer.avatar, trainer.tracks, trainer.registered)
+            return self._imitation.segment(rng)
+        self._imitation = None
         return trainer.segment(rng, now)
+
+
+def _segment(lessons: Lessons, rng: np.random.Generator, now: Position, step: int) -> Progress:
+    try:
+        return lessons.segment(rng, now)
     except TrainingError as error:
         raise TrainingError(f"step {step} ({now.stage}): {error}") from error
 
@@ -239,6 +290,7 @@ def save(
     avatar: Avatar,
     optimizers: Mapping[str, torch.optim.Optimizer],
     trainer: SegmentTrainer,
+    registration: Registration,
     step: int,
     progress: float,
 ) -> None:
@@ -251,6 +303,7 @@ def save(
         ckpt.save_optimizers(optimizers, folder)
     workers.barrier()
     ckpt.save_rollouts(folder, workers.rank(), *trainer.carried())
+    ckpt.save_registration(folder, workers.rank(), registration.carried())
     workers.barrier()
     if workers.rank() == 0:
         ckpt.save_progress(folder, step, progress)
@@ -281,7 +334,13 @@ class Clock:
 def _smooth(before: Progress | None, now: Progress) -> Progress:
     if before is None:
         return now
-    return Progress(0.95 * before.loss + 0.05 * now.loss, 0.95 * before.mse + 0.05 * now.mse)
+    # An update without images keeps what the last images said.
+    mse = before.mse if now.mse is None or before.mse is None else 0.95 * before.mse + 0.05 * now.mse
+    return Progress(0.95 * before.loss + 0.05 * now.loss, mse)
+
+
+def _psnr(mse: float | None) -> float:
+    return -10 * math.log10(max(mse or 0.0, 1e-10))
 
 
 def _report(
@@ -294,7 +353,7 @@ def _report(
     seconds: float,
     reporter: Reporter | None,
 ) -> None:
-    psnr = -10 * math.log10(max(smoothed.mse, 1e-10))
+    psnr = _psnr(smoothed.mse)
     line = Report(step, config.schedule.steps, progress, now.stage, smoothed.loss, psnr, seconds)
     with run.metrics.open("a") as file:
         file.write(json.dumps(dataclasses.asdict(line)) + "\n")

@@ -16,6 +16,8 @@ from dsar.types import RenderOutput
 
 _GAMMA = 0.1
 _CENTIMETRES = 100.0
+_KNEE = 0.5
+"""Centimetres below which a distance is squared after all, to be smooth."""
 _SSIM_WINDOW, _SSIM_SIGMA = 11, 1.5
 
 
@@ -96,6 +98,17 @@ def spatial_loss(
     """Return the mean squared difference, cm, of the offsets of linked control points (flat `cells`)."""
     offsets = offset.flatten(2)[:, :, cells] * _CENTIMETRES
     return (offsets[:, :, links[:, 0]] - offsets[:, :, links[:, 1]]).square().sum(1).mean()
+
+
+def registered_loss(
+    offset: Float[Tensor, "b 3 h w"], registered: Float[Tensor, "b 3 h w"], cells: Int64[Tensor, " p"]
+) -> Float[Tensor, " b"]:
+    """Return the mean distance, cm, of the offsets at the control points (flat `cells`) to registered ones.
+
+    Not squared: at rest the last millimetres count, in a spin the map itself is centimetres off.
+    """
+    error = (offset - registered).flatten(2)[:, :, cells] * _CENTIMETRES
+    return ((error.square().sum(1) + _KNEE**2).sqrt() - _KNEE).mean(1)
 
 
 @dataclass(frozen=True)

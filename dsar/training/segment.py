@@ -1,6 +1,7 @@
 """One update's worth of work: a segment of K frames of several rollouts, rendered and compared."""
 
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,12 +9,13 @@ import torch
 from torch import Tensor, nn
 
 from dsar.avatar.avatar import Avatar, contexts
+from dsar.avatar.mirror import mirror_track
 from dsar.config import TrainConfig
 from dsar.errors import TrainingError
 from dsar.network import NetworkOutput, NetworkState
 from dsar.network.maps import FrameMaps
 from dsar.raster import rasterize, reduced_dilation
-from dsar.training.losses import TemporalRecord, image_loss, spatial_loss, temporal_loss
+from dsar.training.losses import TemporalRecord, image_loss, registered_loss, spatial_loss, temporal_loss
 from dsar.training.stages import Position
 from dsar.training.streams import Stream, Streams
 from dsar.training.targets import load_target
@@ -29,8 +31,8 @@ class Progress:
 
     loss: float
     """Total loss per rendered view."""
-    mse: float
-    """Mean squared colour error per view, over the crop and a random background."""
+    mse: float | None
+    """Mean squared colour error per view, over the crop and a random background; None without images."""
 
 
 class SegmentTrainer:
@@ -46,8 +48,11 @@ class SegmentTrainer:
     ) -> None:
         self.config, self.capture, self.avatar, self.lpips = config, capture, avatar, lpips
         self.tracks = {name: avatar.track(capture.motions[name]) for name in clips}
-        self.streams = Streams(clips, config.schedule.streams)
+        self.mirror_tracks = {name: mirror_track(track) for name, track in self.tracks.items()}
+        self.streams = Streams(clips, config.schedule.streams, config.schedule.mirrored)
         self.state: NetworkState = avatar.start(config.schedule.streams)
+        self.registered: Mapping[str, tuple[range, Tensor]] = {}
+        """Frames that have a registered map, and the maps, by sequence."""
         self.records: deque[TemporalRecord] = deque(maxlen=max(3, config.model.window))
 
     def template_segment(
@@ -71,16 +76,23 @@ class SegmentTrainer:
         for _ in range(schedule.segment):
             places, fresh = self.streams.next_frames(rng, position.horizon)
             self.state = self.state.restart(torch.tensor(fresh))
-            context = torch.cat([contexts(self.tracks[p.sequence], torch.tensor([p.frame])) for p in places])
-            output, self.state, observed = self.avatar.advance(context, self.state, streams=with_streams)
+            mirrored = torch.tensor([p.mirrored for p in places])
+            context = self._contexts(places, self.tracks)
+            seen = torch.where(
+                mirrored[:, None, None, None, None], self._contexts(places, self.mirror_tracks), context
+            )
+            output, self.state, observed = self.avatar.advance(seen, self.state, streams=with_streams)
             shown = [i for i in range(len(places)) if rng.random() < schedule.rendered]
-            gaussians = self.avatar.gaussians(context[shown], output.select(shown)) if shown else []
+            answers = self.avatar.unmirror(output.select(shown), mirrored[shown])
+            gaussians = self.avatar.gaussians(context[shown], answers) if shown else []
             for place, each in zip((places[i] for i in shown), gaussians, strict=True):
                 view = self._views(rng, each, place.sequence, place.frame, position.reduction)
                 loss, mse, count = loss + view[0], mse + view[1], count + schedule.views
             regularisers = self._spatial(output)
+            if self.registered:
+                regularisers = regularisers + self._registered(self.avatar.unmirror(output, mirrored), places)
             if with_streams:
-                regularisers = regularisers + self._temporal(context, output, observed, places)
+                regularisers = regularisers + self._temporal(seen, output, observed, places)
             loss = loss + regularisers * len(shown) * schedule.views
             self.streams.advance()
         progress = self._finish(loss, mse, max(count, 1))
@@ -88,6 +100,9 @@ class SegmentTrainer:
         for _ in range(len(self.records)):
             self.records.append(self.records.popleft().detach())
         return progress
+
+    def _contexts(self, places: list[Stream], tracks: dict[str, Tensor]) -> Tensor:
+        return torch.cat([contexts(tracks[p.sequence], torch.tensor([p.frame])) for p in places])
 
     def carried(self) -> tuple[dict[str, Tensor], list[dict[str, str | int]]]:
         """Return what must survive a restart: the rollouts' state as tensors, and their places."""
@@ -139,6 +154,19 @@ class SegmentTrainer:
 
     def _spatial(self, output: NetworkOutput) -> Tensor:
         return self.config.loss.spatial * spatial_loss(output.offset, self.avatar.cells, self.avatar.links)
+
+    def _registered(self, output: NetworkOutput, places: list[Stream]) -> Tensor:
+        """Return the loss against registered maps, of the frames that have one."""
+        having = [
+            i
+            for i, place in enumerate(places)
+            if place.sequence in self.registered and place.frame in self.registered[place.sequence][0]
+        ]
+        if not having:
+            return torch.zeros(())
+        maps = torch.stack([self.registered[places[i].sequence][1][places[i].frame] for i in having])
+        distances = registered_loss(output.offset[having], maps, self.avatar.cells)
+        return self.config.loss.registered * distances.sum() / len(places)
 
     def _temporal(
         self, context: Tensor, output: NetworkOutput, observed: FrameMaps, places: list[Stream]

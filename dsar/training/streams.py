@@ -16,13 +16,15 @@ class Stream:
     """Frame it will see next."""
     age: int
     """Frames it has seen since it was fresh."""
+    mirrored: bool = False
+    """Whether it sees the mirrored motion."""
 
 
 class Streams:
     """A fixed number of rollouts over clips of frames [start, stop) of named sequences."""
 
-    def __init__(self, clips: Mapping[str, range], count: int) -> None:
-        self.clips = dict(clips)
+    def __init__(self, clips: Mapping[str, range], count: int, mirrored: float = 0.0) -> None:
+        self.clips, self.mirrored = dict(clips), mirrored
         self.streams: list[Stream | None] = [None] * count
 
     def next_frames(self, rng: np.random.Generator, horizon: int) -> tuple[list[Stream], list[bool]]:
@@ -53,4 +55,4 @@ class Streams:
         clip = self.clips[name]
         latest = clip.stop - (1 if anywhere else horizon)
         start = int(rng.integers(clip.start, latest + 1)) if latest > clip.start else clip.start
-        return Stream(name, start, 0)
+        return Stream(name, start, 0, bool(rng.random() < self.mirrored))

@@ -6,7 +6,7 @@ Small tensors make intra-operation threads useless here, so every worker compute
 
 import os
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -46,7 +46,7 @@ class Gradients:
             dist.all_reduce(self.buffer)
         stopped, share = bool(self.buffer[-2] > 0), float(self.buffer[-1])
         if dist.is_initialized():
-            self.buffer /= dist.get_world_size()
+            self.buffer /= count()
         return stopped, share
 
 
@@ -55,10 +55,22 @@ def rank() -> int:
     return dist.get_rank() if dist.is_initialized() else 0
 
 
+def count() -> int:
+    """Return the number of workers."""
+    return dist.get_world_size() if dist.is_initialized() else 1
+
+
 def barrier() -> None:
     """Wait for all workers."""
     if dist.is_initialized():
         dist.barrier()
+
+
+def add_up(tensors: Iterable[Tensor]) -> None:
+    """Replace each tensor by its sum over workers."""
+    if dist.is_initialized():
+        for tensor in tensors:
+            dist.all_reduce(tensor)
 
 
 def share_tensors(tensors: Iterator[Tensor]) -> None:

@@ -12,6 +12,7 @@ from dsar.training.losses import (
     TemporalRecord,
     plain_image_loss,
     pyramid_l1,
+    registered_loss,
     spatial_loss,
     ssim,
     temporal_loss,
@@ -119,3 +120,15 @@ def test_fused_losses_equal_the_plain_ones_in_value_and_gradient(size, weights):
         results.append([loss, *torch.autograd.grad(3 * loss, (color, alpha))])
     for plain, fused in zip(*results, strict=True):
         assert torch.allclose(plain, fused, rtol=1e-4, atol=1e-6 * float(plain.detach().abs().max()) + 1e-9)
+
+
+def test_distance_to_registered_maps_is_in_centimetres_and_counts_points_only():
+    cells = torch.tensor([0, 3])
+    registered = torch.zeros(2, 3, 2, 2)
+    offset = torch.zeros(2, 3, 2, 2)
+    offset[1, :, 0, 0] = torch.tensor([0.3, 0.0, 0.4])
+    offset[:, :, 0, 1] = 9.0  # no point lies here
+    loss = registered_loss(offset, registered, cells)
+    assert loss[0] == 0
+    # One of two points is half a metre off; the knee of half a centimetre hardly shows.
+    assert abs(loss[1] - 25.0) < 0.3

@@ -13,7 +13,8 @@ def test_stages_follow_each_other_and_the_horizon_only_grows():
     schedule = ScheduleConfig(pose_share=0.15, horizon=16)
     walk = [position(schedule, i / 1000) for i in range(1000)]
     stages = [p.stage for p in walk]
-    assert stages == sorted(stages, key=["template", "pose", "autoregressive"].index)
+    assert stages == sorted(stages, key=["template", "imitation", "pose", "autoregressive"].index)
+    assert len(set(stages)) == 4
     horizons = [p.horizon for p in walk if p.stage == "autoregressive"]
     assert horizons == sorted(horizons)
     assert horizons[0] == schedule.horizon

@@ -1,0 +1,241 @@
+"""Registration: offset maps of the garment, fitted to the images of the training frames one after another.
+
+A rendered print tells where cloth is only while the guess is right to within half a period of it. A network
+that starts from rest is not, and settles for a blur. From one frame to the next cloth hardly moves that far:
+maps that follow it through a sequence keep its place, and are the network's first teacher (extension).
+"""
+
+import dataclasses
+import functools
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dsar.avatar.avatar import Avatar, blend, contexts
+from dsar.config import ScheduleConfig, TrainConfig
+from dsar.geometry.cameras import project
+from dsar.network import NetworkOutput
+from dsar.raster import rasterize, reduced_dilation
+from dsar.training import workers
+from dsar.training.losses import image_loss, spatial_loss
+from dsar.training.segment import Progress
+from dsar.training.targets import Target, load_target
+from dsar.types import Capture
+
+REDUCTION = 2
+"""Factor by which images are reduced."""
+LIMIT = 0.4
+"""Largest share of a budget of time; frames that are left by then stay without a map."""
+RATE = 0.02
+"""Adam's step, metres."""
+STEPS = 6
+"""Steps of Adam a frame."""
+VIEWS, FAST_VIEWS = 2, 4
+"""Cameras of a step, usually and where the cloth is fast."""
+FAST = 0.025
+"""Mean change of the offset, metres, that inertia asks for in one frame, above which the cloth is fast."""
+STRIDES = (0.0, 0.5, 1.0, 1.4)
+"""Shares of that change which are tried as the first guess then."""
+MARGIN = 8
+"""Pixels kept around the garment."""
+NOISE = 0.01
+"""Metres of change that are noise rather than inertia."""
+STRUCTURE = {"ssim": 0.5, "alpha": 0.3, "lpips": 0.0}
+"""Image losses that differ from the network's: structure finds the place of a print."""
+
+
+class Registration:
+    """The offset maps of all training frames, and one worker's share of the work to fit them."""
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        capture: Capture,
+        avatar: Avatar,
+        tracks: Mapping[str, Float[Tensor, "_ j 4 4"]],
+        clips: Mapping[str, range],
+    ) -> None:
+        """Prepare to fit the frames of `clips`, of which each worker gets its share."""
+        self.capture, self.avatar, self.tracks, self.seed = capture, avatar, tracks, config.seed
+        self.schedule = config.schedule
+        self.loss = dataclasses.replace(config.loss, **STRUCTURE)
+        self.garment = avatar.garment_points()
+        wanted = clips if config.schedule.imitation_share and len(self.garment) else {}
+        shares = share_out(wanted, workers.count())
+        self.longest = max(sum(len(clips[name]) for name in share) for share in shares)
+        self.places = [(name, frame) for name in shares[workers.rank()] for frame in clips[name]]
+        self.starts = {name: clip.start for name, clip in wanted.items()}
+        self.order = list(clips)
+        self.count = 0
+        """Frames fitted by the busiest worker."""
+        self.used = 0.0
+        """Share of the budget of time that was used."""
+        self.maps = {name: torch.zeros(len(tracks[name]), 3, *avatar.grid_size) for name in wanted}
+        self.fitted = {name: torch.zeros((), dtype=torch.int64) for name in wanted}
+
+    @property
+    def complete(self) -> bool:
+        """Whether every worker has fitted its frames, or time is up."""
+        return self.count >= self.longest or self.used >= LIMIT
+
+    @property
+    def result(self) -> dict[str, tuple[range, Float[Tensor, "_ 3 h w"]]]:
+        """The frames of each sequence that have a map, and its maps."""
+        frames = {name: range(start, start + int(self.fitted[name])) for name, start in self.starts.items()}
+        return {name: (frames[name], maps) for name, maps in self.maps.items() if frames[name]}
+
+    @property
+    def haste(self) -> float:
+        """Factor by which the stages after it must advance faster than time for what it took."""
+        left = 1 - self.schedule.template_share
+        return left / (left - self.used) if self.complete else 1.0
+
+    def reduced(self, schedule: ScheduleConfig) -> ScheduleConfig:
+        """Return the schedule, without imitation where there is no garment to imitate."""
+        return schedule if self.maps else dataclasses.replace(schedule, imitation_share=0.0)
+
+    def share(self) -> None:
+        """Give all workers what each has fitted."""
+        workers.add_up([*self.maps.values(), *self.fitted.values()])
+        self.count, self.places = self.longest, []
+
+    def carried(self) -> dict[str, Tensor]:
+        """Return what must survive a restart."""
+        tensors = {f"map.{name}": maps for name, maps in self.maps.items()}
+        tensors |= {f"fitted.{name}": fitted for name, fitted in self.fitted.items()}
+        return tensors | {"count": torch.tensor(self.count), "used": torch.tensor(self.used)}
+
+    def carry_on(self, tensors: Mapping[str, Tensor]) -> None:
+        """Restore what `carried` returned."""
+        self.maps = {name: tensors[f"map.{name}"] for name in self.maps}
+        self.fitted = {name: tensors[f"fitted.{name}"] for name in self.fitted}
+        self.count, self.used = int(tensors["count"]), float(tensors["used"])
+
+    def advance(self) -> Progress | None:
+        """Fit this worker's next frame, if it has one left."""
+        place = self.places[self.count] if self.count < len(self.places) else None
+        self.count += 1
+        return self.fit(*place) if place is not None else None
+
+    def fit(self, name: str, frame: int) -> Progress:
+        """Fit the map of a frame; those of the frames before it are fitted."""
+        rng = np.random.default_rng([self.seed, self.order.index(name), frame])
+        context = contexts(self.tracks[name], torch.tensor([frame]))
+        guesses, fast = self._guesses(context, name, frame)
+        points = self._posed(context, self._map(guesses[0]))
+        view = functools.cache(functools.partial(self._view, name, frame, points=points))
+        cameras, views = len(self.capture.cameras), FAST_VIEWS if fast else VIEWS
+
+        def some_views() -> list[tuple[Target, float]]:
+            return [view(int(k)) for k in rng.choice(cameras, min(views, cameras), replace=False)]
+
+        offset = guesses[0]
+        if len(guesses) > 1:
+            shown = some_views()
+            with torch.no_grad():
+                losses = [self._compare(context, guess, shown, np.full(3, 0.5))[0] for guess in guesses]
+            offset = guesses[int(torch.stack(losses).argmin())]
+        offset = offset.requires_grad_()
+        optimizer = torch.optim.Adam([offset], RATE, betas=(0.8, 0.9))
+        loss, mse = torch.zeros(()), torch.zeros(())
+        for _ in range(STEPS):
+            optimizer.zero_grad()
+            loss, mse = self._compare(context, offset, some_views(), rng.random(3))
+            loss.backward(inputs=[offset])
+            optimizer.step()
+        self.maps[name][frame] = self._map(offset.detach())[0]
+        self.fitted[name] += 1
+        return Progress(float(loss.detach()), float(mse))
+
+    @torch.no_grad()
+    def _guesses(self, context: Tensor, name: str, frame: int) -> tuple[list[Float[Tensor, "g 3"]], bool]:
+        """Return offsets to start from, and whether the cloth is fast."""
+        avatar, garment = self.avatar, self.garment
+        seen = frame - self.starts[name]
+        if seen == 0:
+            return [torch.zeros(len(garment), 3)], False
+        before = self.maps[name][frame - 1].flatten(1)[:, avatar.cells[garment]].T
+        if seen == 1:
+            return [before], False
+        maps, track = self.maps[name], self.tracks[name]
+        newest, older = (
+            self._posed(contexts(track, torch.tensor([f])), maps[f : f + 1]) for f in (frame - 1, frame - 2)
+        )
+        blended = blend(avatar.control_weights[garment], context[:, :1])[0, 0]
+        rest = torch.linalg.solve(
+            blended[..., :3], (newest + self._smooth(newest - older) - blended[..., 3])[..., None]
+        )[..., 0]
+        axes = avatar.control_axes[garment]
+        change = (axes * (rest - avatar.control_points[garment])[..., None]).sum(1) - before
+        norm = change.norm(dim=1, keepdim=True)
+        change = change * norm / (norm + NOISE)
+        if norm.mean() <= FAST:
+            return [before + change], False
+        return [before + stride * change for stride in STRIDES], True
+
+    def _compare(
+        self,
+        context: Tensor,
+        offset: Float[Tensor, "g 3"],
+        views: list[tuple[Target, float]],
+        background: np.ndarray,
+    ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
+        """Return loss and squared error of views over a background, and how far neighbours part."""
+        avatar = self.avatar
+        maps = self._map(offset)
+        gaussians = avatar.gaussians(context, self._output(maps))[0]
+        color = torch.from_numpy(background.astype(np.float32))
+        loss, mse = torch.zeros(()), torch.zeros(())
+        for target, share in views:
+            output = rasterize(
+                gaussians, target.camera, background=color, dilation=reduced_dilation(REDUCTION)
+            )
+            one, error = image_loss(output, target, color, self.loss, None)
+            loss, mse = loss + share * one / len(views), mse + error / len(views)
+        return loss + self.loss.spatial * spatial_loss(maps, avatar.cells, avatar.links), mse
+
+    def _view(self, name: str, frame: int, camera: int, points: Float[Tensor, "g 3"]) -> tuple[Target, float]:
+        """Return a view of the garment around its points in the world, and its share of the person's view."""
+        target = load_target(self.capture, name, frame, camera, REDUCTION)
+        pixels = project(target.camera, points)[0]
+        height, width = target.alpha.shape
+        low, high = pixels.amin(0).floor().long() - MARGIN, pixels.amax(0).ceil().long() + MARGIN
+        x0, y0 = min(max(int(low[0]), 0), width - 1), min(max(int(low[1]), 0), height - 1)
+        x1, y1 = min(max(int(high[0]), x0 + 1), width), min(max(int(high[1]), y0 + 1), height)
+        color, alpha = target.color[y0:y1, x0:x1].contiguous(), target.alpha[y0:y1, x0:x1].contiguous()
+        part = Target(color, alpha, target.camera.cropped(x0, y0, x1 - x0, y1 - y0))
+        return part, alpha.numel() / target.alpha.numel()
+
+    def _map(self, offset: Float[Tensor, "g 3"]) -> Float[Tensor, "1 3 h w"]:
+        h, w = self.avatar.grid_size
+        flat = offset.new_zeros(3, h * w).index_copy(1, self.avatar.cells[self.garment], offset.T)
+        return flat.reshape(1, 3, h, w)
+
+    def _posed(self, context: Tensor, maps: Float[Tensor, "1 3 h w"]) -> Float[Tensor, "g 3"]:
+        """Return where the garment's control points are in the world."""
+        return self.avatar.deformed_control_points(context, self._output(maps))[0, self.garment]
+
+    def _output(self, maps: Float[Tensor, "1 3 h w"]) -> NetworkOutput:
+        looks = self.avatar.model.appearance_channels
+        return NetworkOutput(maps, maps.new_zeros(1, looks, *self.avatar.grid_size), ())
+
+    def _smooth(self, vectors: Float[Tensor, "g 3"]) -> Float[Tensor, "g 3"]:
+        """Return the mean of each control point of the garment and its neighbours."""
+        avatar = self.avatar
+        spread = torch.zeros(len(avatar.cells), 4)
+        spread[self.garment] = torch.cat([vectors, torch.ones(len(vectors), 1)], 1)
+        total = spread.clone()
+        for a, b in (avatar.links.T, avatar.links.T.flip(0)):
+            total.index_add_(0, a, spread[b])
+        return (total[:, :3] / total[:, 3:].clamp_min(1))[self.garment]
+
+
+def share_out(clips: Mapping[str, range], workers: int) -> list[list[str]]:
+    """Return which sequences each worker gets, so that none has much more to do than another."""
+    shares: list[list[str]] = [[] for _ in range(workers)]
+    for name in sorted(clips, key=lambda name: -len(clips[name])):
+        min(shares, key=lambda share: sum(len(clips[n]) for n in share)).append(name)
+    return shares

@@ -1,0 +1,115 @@
+"""Registered maps follow the true cloth of the embedded capture, and the network learns to follow them."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from dsar.avatar.avatar import Avatar, contexts
+from dsar.config import ModelConfig, TrainConfig
+from dsar.data.capture import open_capture
+from dsar.training import loop
+from dsar.training.imitation import Imitation
+from dsar.training.registration import Registration, share_out
+from dsar.training.segment import SegmentTrainer
+from dsar.training.stages import position
+from dsar.training.workers import Gradients
+
+SEQUENCE = "spin_right"
+LAST = 34
+"""A frame in full spin; the person stands until frame 8."""
+
+
+@pytest.fixture(scope="module")
+def registered():
+    """A template fitted for a few updates, and the first frames of a spin registered with it."""
+    torch.manual_seed(0)
+    config, capture = TrainConfig(), open_capture()
+    avatar = Avatar.from_capture(capture, capture.body, config.atlas, config.model)
+    trainer = SegmentTrainer(config, capture, avatar, loop.training_clips(config, capture), None)
+    still = loop.still_frames(trainer, avatar.fps)
+    optimizers, gradients = (
+        loop.make_optimizers(avatar, config.schedule),
+        Gradients(list(avatar.parameters())),
+    )
+    for step in range(60):
+        loop.set_rates(optimizers, position(config.schedule, 0.12 * step / 60))
+        gradients.clear()
+        trainer.template_segment(np.random.default_rng([0, step]), still, 1)
+        optimizers["adam"].step()
+    avatar.reveal()
+    clips = {SEQUENCE: range(4, LAST + 1)}
+    registration = Registration(config, capture, avatar, trainer.tracks, clips)
+    copy = Registration(config, capture, avatar, trainer.tracks, clips)
+    for _ in range(LAST - 5):
+        registration.advance()
+    copy.carry_on({name: tensor.clone() for name, tensor in registration.carried().items()})
+    for one in (registration, copy):
+        while not one.complete:
+            one.advance()
+    return capture, avatar, registration, copy
+
+
+def distance_to_cloth(capture, avatar, registration, maps) -> float:
+    context = contexts(avatar.track(capture.motions[SEQUENCE]), torch.tensor([LAST]))
+    points = registration._posed(context, maps)
+    cloth = torch.from_numpy(np.asarray(capture.garment(SEQUENCE)[LAST])).float()
+    return float(torch.cdist(points, cloth).amin(1).mean())
+
+
+def test_registered_maps_follow_the_cloth_into_a_spin(registered):
+    capture, avatar, registration, _ = registered
+    frames, maps = registration.result[SEQUENCE]
+    assert frames == range(4, LAST + 1)
+    found = maps[LAST : LAST + 1]
+    assert found.norm(dim=1).mean() > 0.01
+    before = distance_to_cloth(capture, avatar, registration, torch.zeros_like(found))
+    assert distance_to_cloth(capture, avatar, registration, found) < 0.6 * before
+    # The body is left alone.
+    body = torch.ones(len(avatar.cells), dtype=torch.bool)
+    body[avatar.garment_points()] = False
+    assert (maps.flatten(2)[:, :, avatar.cells[body]] == 0).all()
+
+
+def test_registration_goes_on_where_it_was_interrupted(registered):
+    _, _, registration, copy = registered
+    assert torch.equal(registration.maps[SEQUENCE], copy.maps[SEQUENCE])
+    assert registration.result[SEQUENCE][0] == copy.result[SEQUENCE][0]
+
+
+def test_the_network_learns_to_follow_maps_that_lag_behind_the_motion(registered):
+    capture, _, registration, _ = registered
+    torch.manual_seed(0)
+    model = ModelConfig(channels=(8, 16, 16), window=3, memory=2, heads=2)
+    small = Avatar.from_capture(capture, capture.body, TrainConfig().atlas, model)
+    config = dataclasses.replace(TrainConfig(), model=model)
+    tracks = {SEQUENCE: small.track(capture.motions[SEQUENCE])}
+    lesson = Imitation(config, small, tracks, registration.result)
+    optimizers = loop.make_optimizers(small, config.schedule)
+    gradients, losses = Gradients(list(small.parameters())), []
+    for step in range(24):
+        loop.set_rates(optimizers, position(config.schedule, 0.13 + 0.1 * step / 24))
+        gradients.clear()
+        losses.append(lesson.segment(np.random.default_rng([1, step])).loss)
+        for optimizer in optimizers.values():
+            optimizer.step()
+    assert np.mean(losses[-6:]) < 0.8 * np.mean(losses[:6])
+
+
+def test_work_is_shared_out_evenly():
+    clips = {"a": range(100), "b": range(60), "c": range(50), "d": range(5, 15)}
+    shares = share_out(clips, 2)
+    assert sorted(name for share in shares for name in share) == sorted(clips)
+    assert sorted(sum(len(clips[name]) for name in share) for share in shares) == [110, 110]
+    assert share_out({}, 2) == [[], []]
+
+
+def test_a_figure_without_a_garment_is_not_registered():
+    torch.manual_seed(0)
+    config, capture = TrainConfig(), open_capture()
+    bare = dataclasses.replace(config.atlas, garment="off")
+    avatar = Avatar.from_capture(capture, capture.body, bare, config.model)
+    registration = Registration(config, capture, avatar, {}, {SEQUENCE: range(9)})
+    assert registration.complete
+    assert registration.reduced(config.schedule).imitation_share == 0
