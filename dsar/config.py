@@ -47,6 +47,9 @@ class ModelConfig:
     """Feed velocity maps."""
     acceleration: bool = True
     """Feed acceleration maps (extension; it nearly halves the error of driven cloth)."""
+    lags: tuple[float, ...] = (0.1, 0.2, 0.4)
+    """Feed, for each of these times in seconds, how far a running mean of the motion lags behind it
+    (extension): a memory that nothing has to learn."""
     motion_embedding: bool = True
     """Add the embedding of the motion magnitude to the deepest features."""
     channels: tuple[int, ...] = (16, 32, 64)
@@ -71,8 +74,8 @@ class ModelConfig:
 
     @property
     def map_channels(self) -> int:
-        """Channels of a frame's input maps without feedback: position, velocity, acceleration."""
-        return 3 + 3 * self.velocity + 3 * self.acceleration
+        """Channels of a frame's input maps without feedback: position, velocity, acceleration, lags."""
+        return 3 + 3 * self.velocity + 3 * self.acceleration + 3 * len(self.lags)
 
     @property
     def appearance_channels(self) -> int:
@@ -94,7 +97,7 @@ class LossConfig:
     """LPIPS (needs its weights: tools/fetch_lpips.py)."""
     alpha: float = 0.6
     """Absolute difference of alpha and mask (extension)."""
-    spatial: float = 0.001
+    spatial: float = 0.0003
     """Squared difference of the offsets, in cm, of neighbours on the surface (extension): colours repeat
     in a print, so they alone pair cloth with the wrong place; cloth moves together."""
     registered: float = 0.04
@@ -129,14 +132,15 @@ class ScheduleConfig:
     """Share that trains the network without feedback and memory (the paper's stage 1)."""
     half_resolution_share: float = 0.85
     """Share trained on images of half the size; the template is fitted to whole ones."""
-    streams: int = 24
+    streams: int = 64
     """Rollouts that one worker advances together."""
     views: int = 1
     """Cameras rendered per rollout and rendered frame."""
-    rendered: float = 0.33
+    rendered: float = 0.5
     """Share of the frames, drawn by chance, that are rendered and compared; the network sees all."""
-    segment: int = 4
-    """Frames K of truncated back-propagation through time."""
+    segment: int = 1
+    """Frames K of truncated back-propagation through time (the paper's: 4). At equal time many rollouts of
+    one frame teach more than few of several: the state still carries on over whole clips."""
     mirrored: float = 0.5
     """Share of the rollouts that see the mirrored motion (extension): the network learns from twice the
     motions; body and cloth must be cut symmetrically, their looks need not be."""
@@ -197,6 +201,8 @@ class TrainConfig:
             )
         if model.window < 1 or model.memory < 0:
             raise ConfigError(f"model.window is {model.window} (>= 1) and model.memory {model.memory} (>= 0)")
+        if any(lag <= 0 for lag in model.lags):
+            raise ConfigError(f"model.lags is {model.lags}; they are seconds, above 0")
         if not 0 < model.recall < 1:
             raise ConfigError(f"model.recall is {model.recall}; it must lie strictly between 0 and 1")
         if not 0 <= model.sh_degree <= 3:
@@ -224,6 +230,7 @@ PRESETS: dict[str, TrainConfig] = {
             window=10,
             memory=10,
             acceleration=False,
+            lags=(),
             channels=(64, 128, 256, 512),
             heads=8,
             upsample=1,
@@ -240,6 +247,7 @@ PRESETS: dict[str, TrainConfig] = {
             half_resolution_share=0.0,
             streams=1,
             rendered=1.0,
+            segment=4,
             imitation_share=0.0,
             pose_share=0.15,
             mirrored=0.0,

@@ -1,15 +1,15 @@
 """The avatar: template, network and skeleton; one step of it makes one frame of posed Gaussians."""
 
 import torch
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
 from dsar.avatar.fused import bilinear_taps, pose_fused, sample
 from dsar.avatar.garment import beneath, fit_garment_chart
-from dsar.avatar.mirror import mirror_cells, mirror_output
 from dsar.avatar.posing import pose_gaussians
 from dsar.avatar.stillness import stillest_frames
 from dsar.avatar.template import SHOWN, GaussianParameters
+from dsar.avatar.track import contexts, with_lags
 from dsar.body.atlas import Atlas, body_chart
 from dsar.body.model import PARENTS, Body
 from dsar.body.skinning import forward_kinematics
@@ -26,8 +26,7 @@ GARMENT_FRAMES = 12
 class Avatar(nn.Module):
     """A person who can be driven by any SMPL-X motion.
 
-    A *track* is a motion as T_world_rest of every joint per frame; a *context* holds the transforms of
-    a frame, of the one before and of the one before that, newest first.
+    A motion drives it as a *track*, and one step as a *context*; see `dsar.avatar.track`.
     """
 
     texels: Tensor
@@ -38,6 +37,7 @@ class Avatar(nn.Module):
     control_points: Tensor
     control_weights: Tensor
     control_frames: Tensor
+    control_basis: Tensor
     texel_axes: Tensor
     control_axes: Tensor
     map_mean: Tensor
@@ -67,11 +67,15 @@ class Avatar(nn.Module):
         self.register_buffer("control_points", atlas.positions[nearest])
         self.register_buffer("control_weights", atlas.weights[nearest])
         self.register_buffer("control_frames", atlas.frames[nearest])
+        basis = (
+            self.control_weights[:, :, None]
+            * nn.functional.pad(self.control_points, (0, 1), value=1.0)[:, None]
+        )
+        self.register_buffer("control_basis", basis.flatten(1), persistent=False)
         self.register_buffer("links", surface_links(cells, size, atlas.positions[nearest]), persistent=False)
         axes = atlas.frames if model.axes == "surface" else torch.eye(3).expand_as(atlas.frames)
         self.register_buffer("texel_axes", axes.contiguous(), persistent=False)
         self.register_buffer("control_axes", axes[nearest], persistent=False)
-        self.mirror = mirror_cells(self.control_points, self.control_axes)
         rows, columns = atlas.texels // atlas.width, atlas.texels % atlas.width
         taps = bilinear_taps(rows, columns, model.upsample, size)
         self.register_buffer("tap_cells", taps[0], persistent=False)
@@ -100,7 +104,7 @@ class Avatar(nn.Module):
                 hidden = beneath(body, chart, charts[0])
                 charts.append(chart)
         avatar = cls(body, Atlas.stack(charts, hidden), model, fps)
-        avatar.measure_maps(list(tracks.values()))
+        avatar.measure_maps([avatar.track(motion) for motion in motions.values()])
         return avatar
 
     @property
@@ -110,27 +114,33 @@ class Avatar(nn.Module):
         return Body(parents=PARENTS, **{name: getattr(self, f"body_{name}") for name in names})
 
     @property
+    def _body_rows(self) -> int:
+        """Rows of the atlas that its first chart fills, the body's square."""
+        return self.atlas_size[1]
+
+    @property
     def num_gaussians(self) -> int:
         """Gaussians of every frame."""
         return len(self.texels)
 
-    def track(self, motion: Motion) -> Float[Tensor, "f j 4 4"]:
-        """Return T_world_rest of every joint and frame of a motion."""
-        return forward_kinematics(self.body, motion.rotations, motion.translations)
+    def track(self, motion: Motion) -> Float[Tensor, "f k j 4 4"]:
+        """Return the track of a motion."""
+        transforms = forward_kinematics(self.body, motion.rotations, motion.translations)
+        return with_lags(transforms, self.body_joints[0], motion.fps, self.model.lags)
 
     def start(self, batch: int = 1) -> NetworkState:
         """Return the state of rollouts that have seen nothing yet."""
         return self.network.start(batch)
 
-    def maps(self, context: Float[Tensor, "b 3 j 4 4"], fps: float) -> FrameMaps:
-        """Return the network's input maps, in metres, of frames given with their two predecessors."""
-        blended = blend(self.control_weights, context)
-        points = (blended[..., :3] * self.control_points[:, None, :]).sum(-1) + blended[..., 3]
+    def maps(self, context: Float[Tensor, "b t j 4 4"], fps: float) -> FrameMaps:
+        """Return the network's input maps, in metres."""
+        rows = context[..., :3, :].transpose(-3, -2).flatten(-2)
+        points = (rows @ self.control_basis.mT).mT
         pelvis = context[:, 0, 0]
         roots = pelvis[:, :3, :3] @ self.body_joints[0] + pelvis[:, :3, 3]
         headings = heading_matrix(pelvis[:, :3, :3])
         if self.model.axes == "surface":
-            axes = blended[:, 0, :, :, :3] @ self.control_frames
+            axes = blend(self.control_weights, context[:, :1])[:, 0, :, :, :3] @ self.control_frames
         else:
             axes = headings[:, None].expand(-1, len(self.cells), -1, -1)
         return maps_from_points(
@@ -146,7 +156,7 @@ class Avatar(nn.Module):
         )
 
     @torch.no_grad()
-    def measure_maps(self, tracks: list[Float[Tensor, "_ j 4 4"]]) -> None:
+    def measure_maps(self, tracks: list[Float[Tensor, "_ k j 4 4"]]) -> None:
         """Set the statistics that standardise input maps from training motions."""
         maps, speeds = [], []
         for track in tracks:
@@ -155,7 +165,7 @@ class Avatar(nn.Module):
                 maps.append(observed.maps.flatten(2)[:, :, self.cells])
                 speeds.append(observed.speed.flatten(2)[:, :, self.cells])
         values = torch.cat(maps)
-        # Positions are centred; velocities and accelerations keep their zero, which means rest.
+        # Positions are centred; velocities and the like keep their zero, which means rest.
         self.map_mean[:3] = values[:, :3].mean((0, 2))[:, None, None]
         deviation = (values - self.map_mean[:, 0]).square().mean((0, 2)).sqrt()
         self.map_scale.copy_(deviation.clamp_min(1e-3)[:, None, None])
@@ -163,9 +173,8 @@ class Avatar(nn.Module):
 
     def garment_points(self) -> Int64[Tensor, " g"]:
         """Return which control points lie on the garment's chart; none where there is no such chart."""
-        # The body's square is the first chart of the atlas.
         rows = self.cells // self.grid_size[1] * self.model.upsample
-        return (rows >= self.atlas_size[1]).nonzero().squeeze(1)
+        return (rows >= self._body_rows).nonzero().squeeze(1)
 
     @torch.no_grad()
     def reveal(self) -> None:
@@ -176,8 +185,7 @@ class Avatar(nn.Module):
         """
         if not self.texel_hidden.any():
             return
-        # The body's square is the first chart of the atlas.
-        body = self.texels < self.atlas_size[1] ** 2
+        body = self.texels // self.atlas_size[1] < self._body_rows
         bare = (body & ~self.texel_hidden).nonzero().squeeze(1)
         points = self.texel_positions
         source = bare[torch.cdist(points[self.texel_hidden], points[bare]).argmin(1)]
@@ -186,7 +194,7 @@ class Avatar(nn.Module):
         self.texel_hidden.fill_(False)
 
     def advance(
-        self, context: Float[Tensor, "b 3 j 4 4"], state: NetworkState, *, streams: bool = True
+        self, context: Float[Tensor, "b t j 4 4"], state: NetworkState, *, streams: bool = True
     ) -> tuple[NetworkOutput, NetworkState, FrameMaps]:
         """Run the network one frame on; return its output, the next state and the maps it saw."""
         maps, speed, observed = self.see(context)
@@ -194,21 +202,14 @@ class Avatar(nn.Module):
         return output, state, observed
 
     def see(
-        self, context: Float[Tensor, "b 3 j 4 4"]
+        self, context: Float[Tensor, "b t j 4 4"]
     ) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 1 h w"], FrameMaps]:
         """Return standardised maps and motion magnitude for the network, and the maps in metres."""
         observed = self.maps(context, self.fps)
         maps = (observed.maps - self.map_mean) / self.map_scale * self.network.occupied
         return maps, observed.speed / self.speed_scale, observed
 
-    def unmirror(self, output: NetworkOutput, which: Bool[Tensor, " b"]) -> NetworkOutput:
-        """Turn the answers of some rollouts, given to mirrored motions, into those to the motions."""
-        other = mirror_output(output, self.cells, self.mirror)
-        where = which[:, None, None, None]
-        offset = torch.where(where, other.offset, output.offset)
-        return NetworkOutput(offset, torch.where(where, other.appearance, output.appearance), output.features)
-
-    def gaussians(self, context: Float[Tensor, "b 3 j 4 4"], output: NetworkOutput | None) -> list[Gaussians]:
+    def gaussians(self, context: Float[Tensor, "b t j 4 4"], output: NetworkOutput | None) -> list[Gaussians]:
         """Return the posed Gaussians of each batch entry; without an output, the template's."""
         blended = blend(self.texel_weights, context[:, :1])[:, 0]
         if output is None:
@@ -223,7 +224,7 @@ class Avatar(nn.Module):
         return pose_gaussians(self.template.activate(offsets, sample(appearance, taps)), blended)
 
     def deformed_control_points(
-        self, context: Float[Tensor, "b 3 j 4 4"], output: NetworkOutput
+        self, context: Float[Tensor, "b t j 4 4"], output: NetworkOutput
     ) -> Float[Tensor, "b p 3"]:
         """Return the newest frame's control points, offset and posed, world metres."""
         offset = output.offset.flatten(2)[:, :, self.cells].transpose(1, 2)
@@ -232,7 +233,7 @@ class Avatar(nn.Module):
         return (blended[..., :3] * points[..., None, :]).sum(-1) + blended[..., 3]
 
     def step(
-        self, context: Float[Tensor, "b 3 j 4 4"], state: NetworkState
+        self, context: Float[Tensor, "b t j 4 4"], state: NetworkState
     ) -> tuple[list[Gaussians], NetworkState]:
         """Advance rollouts by one frame: posed Gaussians of each, and the state to carry on."""
         output, state, _ = self.advance(context, state)
@@ -240,16 +241,10 @@ class Avatar(nn.Module):
 
 
 def blend(
-    weights: Float[Tensor, "n j"], transforms: Float[Tensor, "b f j 4 4"]
-) -> Float[Tensor, "b f n 3 4"]:
+    weights: Float[Tensor, "n j"], transforms: Float[Tensor, "b t j 4 4"]
+) -> Float[Tensor, "b t n 3 4"]:
     """Return the blended bone transforms of points, by frame."""
     return (weights @ transforms[..., :3, :].flatten(3)).unflatten(-1, (3, 4))
-
-
-def contexts(track: Float[Tensor, "f j 4 4"], frames: Int64[Tensor, " b"]) -> Float[Tensor, "b 3 j 4 4"]:
-    """Return frames with their two predecessors, newest first; the first frame precedes itself."""
-    index = (frames[:, None] - torch.arange(3)).clamp_min(0)
-    return track[index]
 
 
 def grid_cells(atlas: Atlas, upsample: int) -> tuple[Int64[Tensor, " p"], Int64[Tensor, " p"]]:

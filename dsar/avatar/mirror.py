@@ -5,7 +5,7 @@ what the network sees and predicts is mirrored: it learns from twice the motions
 """
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from dsar.body.model import JOINT_NAMES
@@ -17,56 +17,49 @@ _ROTATION = slice(0, 4)
 """Channels of the appearance residual without a mirror image: each texel's quaternion has axes of its own."""
 
 
-def mirror_track(track: Float[Tensor, "f j 4 4"]) -> Float[Tensor, "f j 4 4"]:
-    """Return the mirrored motion of a track: each joint moves as its counterpart, reflected."""
-    flip = torch.cat([_FLIP, torch.ones(1)]).to(track)
-    return flip[:, None] * track[:, _counterparts()] * flip
+def mirror_motion(transforms: Float[Tensor, "*f j 4 4"]) -> Float[Tensor, "*f j 4 4"]:
+    """Return the mirrored motion: each joint moves as its counterpart, reflected."""
+    flip = torch.cat([_FLIP, torch.ones(1)]).to(transforms)
+    return flip[:, None] * transforms[..., _counterparts(), :, :] * flip
 
 
-def mirror_cells(
-    points: Float[Tensor, "p 3"], axes: Float[Tensor, "p 3 3"]
-) -> tuple[Int64[Tensor, " p"], Float[Tensor, "p 3 3"]]:
-    """Return each control point's counterpart and the matrix that takes the counterpart's offset there.
+class Mirror:
+    """The mirror images of an avatar's outputs."""
 
-    Args:
-        points: Control points at rest, metres.
-        axes: The axes of their offsets as columns.
-    """
-    flip = _FLIP.to(points)
-    counterpart = torch.cdist(points * flip, points).argmin(1)
-    return counterpart, axes.mT @ (flip[:, None] * axes[counterpart])
+    def __init__(
+        self, points: Float[Tensor, "p 3"], axes: Float[Tensor, "p 3 3"], cells: Int64[Tensor, " p"]
+    ) -> None:
+        """Pair each control point with the one nearest to its mirror image.
 
+        Args:
+            points: Control points at rest, metres.
+            axes: The axes of their offsets as columns.
+            cells: Their flat grid indices.
+        """
+        flip = _FLIP.to(points)
+        nearest = [torch.cdist(some, points).argmin(1) for some in (points * flip).split(1024)]
+        counterpart = torch.cat(nearest)
+        self._here, self._there = cells, cells[counterpart]
+        self._turn = axes.mT @ (flip[:, None] * axes[counterpart])
 
-def mirror_output(
-    output: NetworkOutput,
-    cells: Int64[Tensor, " p"],
-    mirror: tuple[Int64[Tensor, " p"], Float[Tensor, "p 3 3"]],
-) -> NetworkOutput:
-    """Return what the output to a mirrored motion says of the motion itself, without features.
+    def offset(self, offset: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
+        """Return mirrored offset maps."""
+        flat = offset.flatten(2)
+        moved = self._turn @ flat[:, :, self._there].transpose(1, 2)[..., None]
+        return flat.index_copy(2, self._here, moved[..., 0].transpose(1, 2)).view_as(offset)
 
-    Args:
-        output: The network's output; a change of rotation is dropped.
-        cells: Flat grid indices of the control points.
-        mirror: What `mirror_cells` returned.
-    """
-    appearance = output.appearance.flatten(2)
-    look = appearance[:, :, cells[mirror[0]]]
-    appearance = appearance.index_copy(2, cells, torch.cat([0 * look[:, _ROTATION], look[:, 4:]], 1))
-    offset = mirror_offset(output.offset, cells, mirror)
-    return NetworkOutput(offset, appearance.view_as(output.appearance), ())
+    def undo(self, output: NetworkOutput, which: Bool[Tensor, " b"]) -> NetworkOutput:
+        """Turn the answers of some rollouts, given to mirrored motions, into those to the motions.
 
-
-def mirror_offset(
-    offset: Float[Tensor, "b 3 h w"],
-    cells: Int64[Tensor, " p"],
-    mirror: tuple[Int64[Tensor, " p"], Float[Tensor, "p 3 3"]],
-) -> Float[Tensor, "b 3 h w"]:
-    """Return mirrored offset maps; see `mirror_output`."""
-    counterpart, turn = mirror
-    flat = offset.flatten(2)
-    there = flat[:, :, cells[counterpart]].transpose(1, 2)
-    flat = flat.index_copy(2, cells, (turn @ there[..., None])[..., 0].transpose(1, 2))
-    return flat.view_as(offset)
+        Changes of rotation are dropped from them, and features are as they were.
+        """
+        looks = output.appearance.flatten(2)
+        other = looks[:, :, self._there]
+        other = torch.cat([torch.zeros_like(other[:, _ROTATION]), other[:, _ROTATION.stop :]], 1)
+        appearance = looks.index_copy(2, self._here, other).view_as(output.appearance)
+        where = which[:, None, None, None]
+        offset = torch.where(where, self.offset(output.offset), output.offset)
+        return NetworkOutput(offset, torch.where(where, appearance, output.appearance), output.features)
 
 
 def _counterparts() -> list[int]:

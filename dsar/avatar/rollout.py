@@ -7,7 +7,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dsar.avatar.avatar import Avatar, contexts
+from dsar.avatar.avatar import Avatar
+from dsar.avatar.track import contexts
 from dsar.errors import MotionError
 from dsar.types import Gaussians, GaussianSequence, Motion
 
@@ -64,7 +65,7 @@ def template_sequence(sequence: GaussianSequence, avatar: Avatar, motion: Motion
     return dataclasses.replace(sequence, produce=produce)
 
 
-def _produce(avatar: Avatar, track: Float[Tensor, "f j 4 4"], wanted: set[int]) -> Iterator[Gaussians]:
+def _produce(avatar: Avatar, track: Float[Tensor, "f k j 4 4"], wanted: set[int]) -> Iterator[Gaussians]:
     state = avatar.start()
     for frame in range(max(wanted) + 1):
         with torch.no_grad():

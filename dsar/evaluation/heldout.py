@@ -14,8 +14,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dsar.avatar.avatar import Avatar, contexts
+from dsar.avatar.avatar import Avatar
 from dsar.avatar.rollout import START_FRAME, roll_out
+from dsar.avatar.track import contexts
 from dsar.data.native import NativeCapture
 from dsar.evaluation.metrics import correlation, psnr
 from dsar.raster import rasterize

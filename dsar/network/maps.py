@@ -1,4 +1,4 @@
-"""Position, velocity and acceleration maps: what the network sees of a motion (paper equation 4)."""
+"""Position, velocity, acceleration and lag maps: what the network sees of a motion (paper equation 4)."""
 
 from dataclasses import dataclass
 
@@ -10,6 +10,8 @@ FPS = 30.0
 """Reference rate: velocities are metres per 1/30 s whatever the motion's own rate."""
 SPEED_LIMIT = 0.4
 """Metres per 1/30 s (12 m/s) at which velocities are cut, so that a teleport cannot explode the network."""
+LAG_LIMIT = 1.0
+"""Metres at which lags are cut, likewise."""
 
 
 @dataclass(frozen=True)
@@ -17,7 +19,7 @@ class FrameMaps:
     """The input maps of a batch of frames on the network's grid, metres and reference frames."""
 
     maps: Float[Tensor, "b c h w"]
-    """Position in the heading frame, velocity and acceleration along the given axes; not standardised."""
+    """Position in the heading frame; velocity, acceleration and lags along given axes; not standardised."""
     speed: Float[Tensor, "b 1 h w"]
     """Motion magnitude V, metres per 1/30 s."""
 
@@ -34,7 +36,7 @@ def _resolve(vectors: Float[Tensor, "b p 3"], axes: Float[Tensor, "b p 3 3"]) ->
 
 
 def maps_from_points(
-    points: Float[Tensor, "b 3 p 3"],
+    points: Float[Tensor, "b t p 3"],
     headings: Float[Tensor, "b 3 3"],
     axes: Float[Tensor, "b p 3 3"],
     roots: Float[Tensor, "b 3"],
@@ -45,13 +47,14 @@ def maps_from_points(
     velocity: bool,
     acceleration: bool,
 ) -> FrameMaps:
-    """Return input maps from the posed control points of each frame and of the two before it.
+    """Return input maps from the posed control points of each context.
 
-    `points[:, 0]` is the newest frame, in world metres. Positions are relative to the root on the
-    ground plane and turned by the inverse heading; gravity's direction and the height stay.
-    Velocities are true world velocities, so a spin or a walk remains visible, resolved along `axes`
-    (columns, world) and cut at SPEED_LIMIT. `cells` are flat grid indices of the points; other cells are
-    zero.
+    `points[:, :3]` are those of a frame and the two before it, newest first, in world metres, the rest
+    where running means of the motion put them; a lag is the way from the newest frame to such a mean.
+    Positions are relative to the root on the ground plane and turned by the inverse heading; gravity's
+    direction and the height stay. Velocities are true world velocities, so a spin or a walk remains
+    visible, resolved along `axes` (columns, world) and cut at SPEED_LIMIT; lags likewise at LAG_LIMIT.
+    `cells` are flat grid indices of the points; other cells are zero.
     """
     ground = roots * roots.new_tensor([1.0, 0.0, 1.0])
     rate = fps / FPS
@@ -63,6 +66,8 @@ def maps_from_points(
         channels.append(_resolve(now, axes))
     if acceleration:
         channels.append(_resolve((now - before) * rate, axes))
+    for mean in points[:, 3:].unbind(1):
+        channels.append(_resolve(limit_norm(mean - points[:, 0], LAG_LIMIT), axes))
     values = torch.cat([*channels, now.norm(dim=-1, keepdim=True)], -1)
     grid = values.new_zeros(len(values), values.shape[-1], size[0] * size[1])
     grid[:, :, cells] = values.transpose(1, 2)

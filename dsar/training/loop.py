@@ -24,7 +24,6 @@ from dsar.errors import CaptureError, CheckpointError, ConfigError, TrainingErro
 from dsar.training import checkpoint as ckpt
 from dsar.training import workers
 from dsar.training.checkpoint import Run
-from dsar.training.imitation import Imitation
 from dsar.training.lpips import load_lpips
 from dsar.training.muon import Muon
 from dsar.training.registration import Registration
@@ -118,7 +117,7 @@ def _train(config: TrainConfig, folder: Path, resume: bool, report: Reporter | N
     lpips = load_lpips("alex") if config.loss.lpips else None
     trainer = SegmentTrainer(config, capture, avatar.train(), training_clips(config, capture), lpips)
     registration = Registration(config, capture, avatar, trainer.tracks, trainer.streams.clips)
-    lessons = Lessons(config, trainer, registration)
+    still = still_frames(trainer, avatar.fps)
     schedule = registration.reduced(config.schedule)
     optimizers = make_optimizers(avatar, config.schedule)
     gradients = workers.Gradients(list(avatar.parameters()))
@@ -129,6 +128,7 @@ def _train(config: TrainConfig, folder: Path, resume: bool, report: Reporter | N
         ckpt.load_optimizers(optimizers, run.checkpoint)
         trainer.carry_on(*ckpt.load_rollouts(run.checkpoint, workers.rank()))
         registration.carry_on(ckpt.load_registration(run.checkpoint, workers.rank()))
+        trainer.registered = registration.result
     clock, used, stop = Clock(schedule.minutes), 0.0, False
     smoothed: Progress | None = None
     with _stop_signals() as received:
@@ -141,11 +141,12 @@ def _train(config: TrainConfig, folder: Path, resume: bool, report: Reporter | N
             if now.stage != "template" and not registration.complete:
                 line = Report(step, schedule.steps, progress, "registration", 0.0, 0.0, 0.0)
                 stop, used = _register(registration, gradients, received, clock, line, report)
+                trainer.registered = registration.result
                 continue
             set_rates(optimizers, now)
             rng = np.random.default_rng([config.seed, workers.rank(), step])
             gradients.clear()
-            done = _segment(lessons, rng, now, step)
+            done = _segment(trainer, still, rng, now, step)
             before, (stop, used) = used, gradients.average(bool(received), clock.used())
             if not gradients.buffer.isfinite().all():
                 raise TrainingError(f"step {step}: the gradient of {bad_gradient(avatar)} is not finite")
@@ -187,31 +188,20 @@ def _register(
     return stop, used
 
 
-class Lessons:
-    """What each stage does in one update."""
-
-    def __init__(self, config: TrainConfig, trainer: SegmentTrainer, registration: Registration) -> None:
-        self.config, self.trainer, self.registration = config, trainer, registration
-        self.still = still_frames(trainer, trainer.avatar.fps)
-        self._imitation: Imitation | None = None
-
-    def segment(self, rng: np.random.Generator, now: Position) -> Progress:
-        """Compute the gradients of one update."""
-        trainer = self.trainer
-        if now.stage == "template":
-            return trainer.template_segment(rng, self.still, now.reduction)
-        trainer.registered = self.registration.result
-        if now.stage == "imitation":
-            if self._imitation is None:
-                self._imitation = Imitation(self.config, trainer.avatar, trainer.tracks, trainer.registered)
-            return self._imitation.segment(rng)
-        self._imitation = None
-        return trainer.segment(rng, now)
-
-
-def _segment(lessons: Lessons, rng: np.random.Generator, now: Position, step: int) -> Progress:
+def _segment(
+    trainer: SegmentTrainer,
+    still: list[tuple[str, int]],
+    rng: np.random.Generator,
+    now: Position,
+    step: int,
+) -> Progress:
+    """Compute the gradients of one update."""
     try:
-        return lessons.segment(rng, now)
+        if now.stage == "template":
+            return trainer.template_segment(rng, still, now.reduction)
+        if now.stage == "imitation":
+            return trainer.imitation_segment(rng)
+        return trainer.segment(rng, now)
     except TrainingError as error:
         raise TrainingError(f"step {step} ({now.stage}): {error}") from error
 
@@ -250,7 +240,7 @@ def select_frames(capture: Capture, split: str, frames: str | None) -> dict[str,
 def still_frames(trainer: SegmentTrainer, fps: float) -> list[tuple[str, int]]:
     """Return the near-rest training frames that the template is fitted to."""
     clips = trainer.streams.clips
-    tracks = {name: trainer.tracks[name][: clip.stop] for name, clip in clips.items()}
+    tracks = {name: trainer.tracks[name][: clip.stop, 0] for name, clip in clips.items()}
     per_sequence = max(1, -(-STILL_FRAMES // len(clips)))
     return stillest_frames(tracks, fps, STILL_FRAMES, per_sequence)
 

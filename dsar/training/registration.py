@@ -14,7 +14,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dsar.avatar.avatar import Avatar, blend, contexts
+from dsar.avatar.avatar import Avatar, blend
+from dsar.avatar.track import contexts
 from dsar.config import ScheduleConfig, TrainConfig
 from dsar.geometry.cameras import project
 from dsar.network import NetworkOutput
@@ -29,22 +30,25 @@ REDUCTION = 2
 """Factor by which images are reduced."""
 LIMIT = 0.4
 """Largest share of a budget of time; frames that are left by then stay without a map."""
-RATE = 0.02
-"""Adam's step, metres."""
+RATE, FAST_RATE = 0.01, 0.02
+"""Adam's step, metres, usually and where the cloth is fast."""
 STEPS = 6
 """Steps of Adam a frame."""
 VIEWS, FAST_VIEWS = 2, 4
-"""Cameras of a step, usually and where the cloth is fast."""
-FAST = 0.025
+"""Cameras of a step, likewise."""
+FAST = 0.035
 """Mean change of the offset, metres, that inertia asks for in one frame, above which the cloth is fast."""
 STRIDES = (0.0, 0.5, 1.0, 1.4)
-"""Shares of that change which are tried as the first guess then."""
+"""Shares of that change which are tried as the first guess then; rest is tried always."""
 MARGIN = 8
 """Pixels kept around the garment."""
 NOISE = 0.01
 """Metres of change that are noise rather than inertia."""
 STRUCTURE = {"ssim": 0.5, "alpha": 0.3, "lpips": 0.0}
 """Image losses that differ from the network's: structure finds the place of a print."""
+ROUGHNESS, JOLT = 0.0002, 0.001
+"""Weights of how far neighbours part, in all and in this frame (cm²): the first alone, strong enough to keep
+neighbours together, would also hold back a hem that swings away from the waist."""
 
 
 class Registration:
@@ -55,7 +59,7 @@ class Registration:
         config: TrainConfig,
         capture: Capture,
         avatar: Avatar,
-        tracks: Mapping[str, Float[Tensor, "_ j 4 4"]],
+        tracks: Mapping[str, Float[Tensor, "_ k j 4 4"]],
         clips: Mapping[str, range],
     ) -> None:
         """Prepare to fit the frames of `clips`, of which each worker gets its share."""
@@ -127,23 +131,20 @@ class Registration:
         guesses, fast = self._guesses(context, name, frame)
         points = self._posed(context, self._map(guesses[0]))
         view = functools.cache(functools.partial(self._view, name, frame, points=points))
-        cameras, views = len(self.capture.cameras), FAST_VIEWS if fast else VIEWS
+        cameras = len(self.capture.cameras)
 
         def some_views() -> list[tuple[Target, float]]:
-            return [view(int(k)) for k in rng.choice(cameras, min(views, cameras), replace=False)]
+            count = min(FAST_VIEWS if fast else VIEWS, cameras)
+            return [view(int(k)) for k in rng.choice(cameras, count, replace=False)]
 
-        offset = guesses[0]
-        if len(guesses) > 1:
-            shown = some_views()
-            with torch.no_grad():
-                losses = [self._compare(context, guess, shown, np.full(3, 0.5))[0] for guess in guesses]
-            offset = guesses[int(torch.stack(losses).argmin())]
-        offset = offset.requires_grad_()
-        optimizer = torch.optim.Adam([offset], RATE, betas=(0.8, 0.9))
+        guess = self._best(context, guesses, some_views())
+        offset = guess.clone().requires_grad_()
+        optimizer = torch.optim.Adam([offset], FAST_RATE if fast else RATE, betas=(0.8, 0.9))
         loss, mse = torch.zeros(()), torch.zeros(())
         for _ in range(STEPS):
             optimizer.zero_grad()
             loss, mse = self._compare(context, offset, some_views(), rng.random(3))
+            loss = loss + JOLT * self._roughness(self._map(offset - guess))
             loss.backward(inputs=[offset])
             optimizer.step()
         self.maps[name][frame] = self._map(offset.detach())[0]
@@ -151,30 +152,42 @@ class Registration:
         return Progress(float(loss.detach()), float(mse))
 
     @torch.no_grad()
+    def _best(
+        self, context: Tensor, guesses: list[Float[Tensor, "g 3"]], views: list[tuple[Target, float]]
+    ) -> Float[Tensor, "g 3"]:
+        """Return the guess that the views like best."""
+        losses = [self._compare(context, guess, views, np.full(3, 0.5))[0] for guess in guesses]
+        return guesses[int(torch.stack(losses).argmin())]
+
+    @torch.no_grad()
     def _guesses(self, context: Tensor, name: str, frame: int) -> tuple[list[Float[Tensor, "g 3"]], bool]:
-        """Return offsets to start from, and whether the cloth is fast."""
-        avatar, garment = self.avatar, self.garment
-        seen = frame - self.starts[name]
+        """Return offsets to start from, and whether the cloth is fast.
+
+        Rest is among them, so that a print that was lost is found again when the cloth comes to rest.
+        """
+        garment, seen = self.garment, frame - self.starts[name]
+        rest = torch.zeros(len(garment), 3)
         if seen == 0:
-            return [torch.zeros(len(garment), 3)], False
-        before = self.maps[name][frame - 1].flatten(1)[:, avatar.cells[garment]].T
+            return [rest], False
+        before = self.maps[name][frame - 1].flatten(1)[:, self.avatar.cells[garment]].T
         if seen == 1:
-            return [before], False
-        maps, track = self.maps[name], self.tracks[name]
+            return [before, rest], False
+        change = self._inertia(context, name, frame) - before
+        norm = change.norm(dim=1, keepdim=True)
+        change = change * norm / (norm + NOISE)
+        fast = bool(norm.mean() > FAST)
+        return [before + stride * change for stride in (STRIDES if fast else (1.0,))] + [rest], fast
+
+    def _inertia(self, context: Tensor, name: str, frame: int) -> Float[Tensor, "g 3"]:
+        """Return the offsets of cloth that moves on through the world as it did before this frame."""
+        avatar, garment, maps, track = self.avatar, self.garment, self.maps[name], self.tracks[name]
         newest, older = (
             self._posed(contexts(track, torch.tensor([f])), maps[f : f + 1]) for f in (frame - 1, frame - 2)
         )
+        moved = newest + self._smooth(newest - older)
         blended = blend(avatar.control_weights[garment], context[:, :1])[0, 0]
-        rest = torch.linalg.solve(
-            blended[..., :3], (newest + self._smooth(newest - older) - blended[..., 3])[..., None]
-        )[..., 0]
-        axes = avatar.control_axes[garment]
-        change = (axes * (rest - avatar.control_points[garment])[..., None]).sum(1) - before
-        norm = change.norm(dim=1, keepdim=True)
-        change = change * norm / (norm + NOISE)
-        if norm.mean() <= FAST:
-            return [before + change], False
-        return [before + stride * change for stride in STRIDES], True
+        points = torch.linalg.solve(blended[..., :3], (moved - blended[..., 3])[..., None])[..., 0]
+        return (avatar.control_axes[garment] * (points - avatar.control_points[garment])[..., None]).sum(1)
 
     def _compare(
         self,
@@ -195,7 +208,10 @@ class Registration:
             )
             one, error = image_loss(output, target, color, self.loss, None)
             loss, mse = loss + share * one / len(views), mse + error / len(views)
-        return loss + self.loss.spatial * spatial_loss(maps, avatar.cells, avatar.links), mse
+        return loss + ROUGHNESS * self._roughness(maps), mse
+
+    def _roughness(self, maps: Float[Tensor, "1 3 h w"]) -> Float[Tensor, ""]:
+        return spatial_loss(maps, self.avatar.cells, self.avatar.links)
 
     def _view(self, name: str, frame: int, camera: int, points: Float[Tensor, "g 3"]) -> tuple[Target, float]:
         """Return a view of the garment around its points in the world, and its share of the person's view."""

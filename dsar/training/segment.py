@@ -1,28 +1,32 @@
 """One update's worth of work: a segment of K frames of several rollouts, rendered and compared."""
 
+import dataclasses
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
-from dsar.avatar.avatar import Avatar, contexts
-from dsar.avatar.mirror import mirror_track
+from dsar.avatar.avatar import Avatar
+from dsar.avatar.mirror import Mirror, mirror_motion
+from dsar.avatar.track import contexts
 from dsar.config import TrainConfig
 from dsar.errors import TrainingError
 from dsar.network import NetworkOutput, NetworkState
 from dsar.network.maps import FrameMaps
 from dsar.raster import rasterize, reduced_dilation
 from dsar.training.losses import TemporalRecord, image_loss, registered_loss, spatial_loss, temporal_loss
-from dsar.training.stages import Position
+from dsar.training.stages import WHOLE_CLIP, Position
 from dsar.training.streams import Stream, Streams
 from dsar.training.targets import load_target
 from dsar.types import Capture, Gaussians
 
 TEMPLATE_FRAMES = 8
 """Frames of an update of the template alone."""
+_NO_MAPS = (range(0),)
 
 
 @dataclass(frozen=True)
@@ -33,6 +37,24 @@ class Progress:
     """Total loss per rendered view."""
     mse: float | None
     """Mean squared colour error per view, over the crop and a random background; None without images."""
+
+
+@dataclass(frozen=True)
+class _Step:
+    """One frame of every rollout."""
+
+    places: list[Stream]
+    """Where each rollout stands."""
+    context: Float[Tensor, "b t j 4 4"]
+    """Each one's motion, as it was filmed."""
+    seen: Float[Tensor, "b t j 4 4"]
+    """The same, or its mirror image."""
+    observed: FrameMaps
+    """The network's input, of what was seen."""
+    output: NetworkOutput
+    """The network's answer to what was seen."""
+    answer: NetworkOutput
+    """The same turned back to what was filmed."""
 
 
 class SegmentTrainer:
@@ -48,8 +70,12 @@ class SegmentTrainer:
     ) -> None:
         self.config, self.capture, self.avatar, self.lpips = config, capture, avatar, lpips
         self.tracks = {name: avatar.track(capture.motions[name]) for name in clips}
-        self.mirror_tracks = {name: mirror_track(track) for name, track in self.tracks.items()}
         self.streams = Streams(clips, config.schedule.streams, config.schedule.mirrored)
+        self.mirror = (
+            Mirror(avatar.control_points, avatar.control_axes, avatar.cells)
+            if config.schedule.mirrored
+            else None
+        )
         self.state: NetworkState = avatar.start(config.schedule.streams)
         self.registered: Mapping[str, tuple[range, Tensor]] = {}
         """Frames that have a registered map, and the maps, by sequence."""
@@ -68,41 +94,59 @@ class SegmentTrainer:
             loss, mse = loss + view[0], mse + view[1]
         return self._finish(loss, mse, TEMPLATE_FRAMES * self.config.schedule.views)
 
+    def imitation_segment(self, rng: np.random.Generator) -> Progress:
+        """Advance every rollout by K frames and back-propagate the distance to the registered maps."""
+        self.avatar.reveal()
+        loss = torch.zeros(())
+        for _ in range(self.config.schedule.segment):
+            step = self._step(rng, WHOLE_CLIP, streams=True)
+            loss = loss + self._registered(step)
+        self._cut()
+        return self._finish(loss, None, self.config.schedule.segment)
+
     def segment(self, rng: np.random.Generator, position: Position) -> Progress:
         """Advance every rollout by K frames and back-propagate through them, the whole body shown."""
         self.avatar.reveal()
-        schedule, with_streams = self.config.schedule, position.stage == "autoregressive"
+        schedule, streams = self.config.schedule, position.stage == "autoregressive"
         loss, mse, count = torch.zeros(()), torch.zeros(()), 0
         for _ in range(schedule.segment):
-            places, fresh = self.streams.next_frames(rng, position.horizon)
-            self.state = self.state.restart(torch.tensor(fresh))
-            mirrored = torch.tensor([p.mirrored for p in places])
-            context = self._contexts(places, self.tracks)
-            seen = torch.where(
-                mirrored[:, None, None, None, None], self._contexts(places, self.mirror_tracks), context
-            )
-            output, self.state, observed = self.avatar.advance(seen, self.state, streams=with_streams)
-            shown = [i for i in range(len(places)) if rng.random() < schedule.rendered]
-            answers = self.avatar.unmirror(output.select(shown), mirrored[shown])
-            gaussians = self.avatar.gaussians(context[shown], answers) if shown else []
-            for place, each in zip((places[i] for i in shown), gaussians, strict=True):
+            step = self._step(rng, position.horizon, streams=streams)
+            shown = [i for i in range(len(step.places)) if rng.random() < schedule.rendered]
+            answers = step.answer.select(shown)
+            gaussians = self.avatar.gaussians(step.context[shown], answers) if shown else []
+            for place, each in zip((step.places[i] for i in shown), gaussians, strict=True):
                 view = self._views(rng, each, place.sequence, place.frame, position.reduction)
                 loss, mse, count = loss + view[0], mse + view[1], count + schedule.views
-            regularisers = self._spatial(output)
+            regularisers = self._spatial(step.output)
             if self.registered:
-                regularisers = regularisers + self._registered(self.avatar.unmirror(output, mirrored), places)
-            if with_streams:
-                regularisers = regularisers + self._temporal(seen, output, observed, places)
+                regularisers = regularisers + self.config.loss.registered * self._registered(step)
+            if streams:
+                regularisers = regularisers + self._temporal(step)
             loss = loss + regularisers * len(shown) * schedule.views
-            self.streams.advance()
-        progress = self._finish(loss, mse, max(count, 1))
+        self._cut()
+        return self._finish(loss, mse, max(count, 1))
+
+    def _step(self, rng: np.random.Generator, horizon: int, *, streams: bool) -> "_Step":
+        """Advance every rollout by one frame."""
+        places, fresh = self.streams.next_frames(rng, horizon)
+        self.state = self.state.restart(torch.tensor(fresh))
+        seen = context = torch.cat(
+            [contexts(self.tracks[p.sequence], torch.tensor([p.frame])) for p in places]
+        )
+        mirrored = torch.tensor([place.mirrored for place in places])
+        if self.mirror is not None:
+            seen = torch.where(mirrored[:, None, None, None, None], mirror_motion(context), context)
+        output, self.state, observed = self.avatar.advance(seen, self.state, streams=streams)
+        answer = self.mirror.undo(output, mirrored) if self.mirror is not None else output
+        places = [dataclasses.replace(place) for place in places]
+        self.streams.advance()
+        return _Step(places, context, seen, observed, output, answer)
+
+    def _cut(self) -> None:
+        """Cut what the rollouts carry on from the graph of this segment."""
         self.state = self.state.detach()
         for _ in range(len(self.records)):
             self.records.append(self.records.popleft().detach())
-        return progress
-
-    def _contexts(self, places: list[Stream], tracks: dict[str, Tensor]) -> Tensor:
-        return torch.cat([contexts(tracks[p.sequence], torch.tensor([p.frame])) for p in places])
 
     def carried(self) -> tuple[dict[str, Tensor], list[dict[str, str | int]]]:
         """Return what must survive a restart: the rollouts' state as tensors, and their places."""
@@ -155,39 +199,34 @@ class SegmentTrainer:
     def _spatial(self, output: NetworkOutput) -> Tensor:
         return self.config.loss.spatial * spatial_loss(output.offset, self.avatar.cells, self.avatar.links)
 
-    def _registered(self, output: NetworkOutput, places: list[Stream]) -> Tensor:
-        """Return the loss against registered maps, of the frames that have one."""
-        having = [
-            i
-            for i, place in enumerate(places)
-            if place.sequence in self.registered and place.frame in self.registered[place.sequence][0]
+    def _registered(self, step: "_Step") -> Tensor:
+        """Return the mean distance, cm, to the registered maps; frames without one count as reached."""
+        known = [p.frame in self.registered.get(p.sequence, _NO_MAPS)[0] for p in step.places]
+        maps = [
+            self.registered[place.sequence][1][place.frame] if has else torch.zeros_like(answer)
+            for has, place, answer in zip(known, step.places, step.answer.offset, strict=True)
         ]
-        if not having:
-            return torch.zeros(())
-        maps = torch.stack([self.registered[places[i].sequence][1][places[i].frame] for i in having])
-        distances = registered_loss(output.offset[having], maps, self.avatar.cells)
-        return self.config.loss.registered * distances.sum() / len(places)
+        distances = registered_loss(step.answer.offset, torch.stack(maps), self.avatar.cells)
+        return (distances * torch.tensor(known)).mean()
 
-    def _temporal(
-        self, context: Tensor, output: NetworkOutput, observed: FrameMaps, places: list[Stream]
-    ) -> Tensor:
+    def _temporal(self, step: "_Step") -> Tensor:
         """Append this frame's record and return the temporal losses against the frames before it."""
         avatar = self.avatar
-        posed = avatar.deformed_control_points(context, output)
-        self.records.append(TemporalRecord(output, posed, observed.speed))
-        ages = [place.age for place in places]
+        posed = avatar.deformed_control_points(step.seen, step.output)
+        self.records.append(TemporalRecord(step.output, posed, step.observed.speed))
+        ages = [place.age for place in step.places]
         return temporal_loss(
             list(self.records), ages, avatar.network.occupied, avatar.cells, self.config.loss
         )
 
-    def _finish(self, loss: Tensor, mse: Tensor, count: int) -> Progress:
+    def _finish(self, loss: Tensor, mse: Tensor | None, count: int) -> Progress:
         loss = loss / count
         if not loss.isfinite():
             raise TrainingError(
                 f"the loss is {float(loss.detach())}; first tensor that is not finite: {self._culprit()}"
             )
         loss.backward()
-        return Progress(float(loss.detach()), float(mse) / count)
+        return Progress(float(loss.detach()), float(mse) / count if mse is not None else None)
 
     def _culprit(self) -> str:
         named = [*self.avatar.named_parameters(), *((f"state.{k}", v) for k, v in self.carried()[0].items())]

@@ -73,13 +73,6 @@ def add_up(tensors: Iterable[Tensor]) -> None:
             dist.all_reduce(tensor)
 
 
-def share_tensors(tensors: Iterator[Tensor]) -> None:
-    """Copy the first worker's tensors to all."""
-    if dist.is_initialized():
-        for tensor in tensors:
-            dist.broadcast(tensor, 0)
-
-
 def run_workers(count: int, work: Callable[..., None], arguments: tuple[Any, ...], report: Any) -> None:
     """Call `work(*arguments, report)` in `count` processes joined in a group, this one being the first.
 

@@ -83,7 +83,7 @@ def test_frames_outside_the_motion_and_foreign_rates_are_refused(avatar):
 def test_two_thousand_frames_stay_finite_and_bounded(avatar):
     motion = dance(2000)
     track, state, largest = avatar.track(motion), avatar.start(), []
-    from dsar.avatar.avatar import contexts
+    from dsar.avatar.track import contexts
 
     with torch.no_grad():
         for frame in range(len(motion)):

@@ -1,0 +1,80 @@
+"""What a track remembers of a motion."""
+
+import math
+
+import torch
+
+from dsar.avatar.mirror import mirror_motion
+from dsar.avatar.track import contexts, with_lags
+from dsar.body.files import load_body
+from dsar.body.skinning import forward_kinematics
+
+FPS, LAG = 30.0, 0.2
+BODY = load_body()
+PELVIS = BODY.joints[0]
+
+
+def walk(frames: int, turn: float = 0.0, step: float = 0.0) -> torch.Tensor:
+    """A stiff body that turns and walks steadily, after a first frame."""
+    rotations = torch.zeros(frames, 55, 3)
+    rotations[:, 0, 1] = turn * torch.arange(frames)
+    translations = torch.zeros(frames, 3)
+    translations[:, 2] = step * torch.arange(frames)
+    return forward_kinematics(BODY, rotations, translations)
+
+
+def test_the_mean_forgets_exponentially():
+    transforms = walk(50, turn=0.1)
+    track = with_lags(transforms, PELVIS, FPS, (LAG,))
+    assert torch.equal(track[:, 0], transforms)
+    # The same as a sum over the whole past, of which the first frame lasted forever.
+    keep = math.exp(-1 / (LAG * FPS))
+    weights = (1 - keep) * keep ** torch.arange(50.0).flip(0)
+    weights[0] /= 1 - keep
+    # The body stays in place, so that no root is to be moved.
+    root = transforms[:, 0, :3, :3] @ PELVIS + transforms[:, 0, :3, 3]
+    assert (root - root[0]).abs().max() < 1e-5
+    expected = (weights[:, None, None, None] * transforms).sum(0)
+    torch.testing.assert_close(track[-1, 1], expected, atol=1e-5, rtol=0)
+
+
+def test_a_steady_walk_does_not_lag_behind_itself_and_a_turn_does():
+    straight = with_lags(walk(60, step=0.05), PELVIS, FPS, (LAG,))
+    torch.testing.assert_close(straight[:, 1], straight[:, 0], atol=1e-5, rtol=0)
+    turning = with_lags(walk(60, turn=0.2), PELVIS, FPS, (LAG,))
+    hand = BODY.joints[20]
+    now, lagged = (turning[-1, k, 20, :3, :3] @ hand + turning[-1, k, 20, :3, 3] for k in (0, 1))
+    assert (now - lagged).norm() > 0.1
+    # After the turn the lag dies away.
+    still = torch.cat([walk(60, turn=0.2), walk(60, turn=0.2)[-1:].expand(60, -1, -1, -1)])
+    after = with_lags(still, PELVIS, FPS, (LAG,))
+    assert (after[-1, 1] - after[-1, 0]).abs().max() < 1e-3
+
+
+def test_the_future_does_not_change_the_means():
+    transforms = walk(20, turn=0.1)
+    changed = transforms.clone()
+    changed[12:] = walk(20, turn=-0.3)[12:]
+    one, two = (with_lags(each, PELVIS, FPS, (0.1, LAG)) for each in (transforms, changed))
+    assert torch.equal(one[:12], two[:12])
+    assert not torch.equal(one[12], two[12])
+
+
+def test_means_of_the_mirrored_motion_are_mirrored_means():
+    transforms = forward_kinematics(BODY, 0.1 * torch.randn(15, 55, 3).cumsum(0), torch.randn(15, 3))
+    # A pelvis on the mirror's plane, which that of the embedded body misses by a millimetre.
+    pelvis = PELVIS * torch.tensor([0.0, 1.0, 1.0])
+    one = mirror_motion(with_lags(transforms, pelvis, FPS, (LAG,)))
+    torch.testing.assert_close(
+        one, with_lags(mirror_motion(transforms), pelvis, FPS, (LAG,)), atol=1e-5, rtol=0
+    )
+
+
+def test_a_context_holds_three_frames_and_the_newest_means():
+    track = with_lags(walk(6, turn=0.3), PELVIS, FPS, (0.1, LAG))
+    context = contexts(track, torch.tensor([0, 4]))
+    assert context.shape[:2] == (2, 5)
+    assert torch.equal(context[0], track[0, [0, 0, 0, 1, 2]])
+    assert torch.equal(context[1, :3], track[[4, 3, 2], 0])
+    assert torch.equal(context[1, 3:], track[4, 1:])
+    assert with_lags(walk(6), PELVIS, FPS, ()).shape[1] == 1
