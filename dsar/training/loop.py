@@ -325,7 +325,9 @@ def _smooth(before: Progress | None, now: Progress) -> Progress:
     if before is None:
         return now
     # An update without images keeps what the last images said.
-    mse = before.mse if now.mse is None or before.mse is None else 0.95 * before.mse + 0.05 * now.mse
+    mse = now.mse if before.mse is None else before.mse
+    if now.mse is not None and before.mse is not None:
+        mse = 0.95 * before.mse + 0.05 * now.mse
     return Progress(0.95 * before.loss + 0.05 * now.loss, mse)
 
 
