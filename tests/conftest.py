@@ -112,7 +112,7 @@ def tiny_capture(tmp_path_factory) -> Path:
 TINY = [
     *("--atlas.resolution", "32", "--atlas.garment", "off", "--model.channels", "8", "16"),
     *("--model.upsample", "2", "--model.heads", "2", "--model.window", "3", "--model.memory", "2"),
-    *("--schedule.horizon", "4", "--schedule.streams", "2", "--progress", "none"),
+    *("--schedule.horizon", "4", "--schedule.streams", "2", "--schedule.segment", "4", "--progress", "none"),
 ]
 
 
