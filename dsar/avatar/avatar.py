@@ -197,17 +197,10 @@ class Avatar(nn.Module):
         self, context: Float[Tensor, "b t j 4 4"], state: NetworkState, *, streams: bool = True
     ) -> tuple[NetworkOutput, NetworkState, FrameMaps]:
         """Run the network one frame on; return its output, the next state and the maps it saw."""
-        maps, speed, observed = self.see(context)
-        output, state = self.network(maps, speed, state, streams=streams)
-        return output, state, observed
-
-    def see(
-        self, context: Float[Tensor, "b t j 4 4"]
-    ) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 1 h w"], FrameMaps]:
-        """Return standardised maps and motion magnitude for the network, and the maps in metres."""
         observed = self.maps(context, self.fps)
         maps = (observed.maps - self.map_mean) / self.map_scale * self.network.occupied
-        return maps, observed.speed / self.speed_scale, observed
+        output, state = self.network(maps, observed.speed / self.speed_scale, state, streams=streams)
+        return output, state, observed
 
     def gaussians(self, context: Float[Tensor, "b t j 4 4"], output: NetworkOutput | None) -> list[Gaussians]:
         """Return the posed Gaussians of each batch entry; without an output, the template's."""
