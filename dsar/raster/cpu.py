@@ -16,17 +16,23 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from dsar.raster.conventions import EPS_2D
-from dsar.raster.kernels_binning import bin_splats, gather_slots_part
+from dsar.raster.kernels_binning import (
+    FIRST_ROWS,
+    count_pairs_part,
+    deal_pairs_part,
+    gather_sums_part,
+    place_pairs,
+    sort_by_depth,
+)
 from dsar.raster.kernels_compositing import (
     SUMS_SIZE,
-    TILE_HEIGHT,
-    TILE_WIDTH,
     composite_backward_part,
     composite_part,
 )
 from dsar.raster.kernels_projection import RECORD_SIZE, project_backward_part, project_part
 from dsar.raster.kernels_shading import shade_backward_part, shade_part
-from dsar.raster.parallel import run_parts
+from dsar.raster.parallel import part_count, run_parts
+from dsar.raster.tiles import TILE
 from dsar.types import Camera, Gaussians, RenderOutput
 
 _log = logging.getLogger(__name__)
@@ -80,19 +86,18 @@ class _Rasterize(torch.autograd.Function):
         directions, background = _as_array(tensors[5], _NO_DIRECTIONS), _as_array(tensors[6], _BLACK)
         n, width, height = len(means), camera.width, camera.height
         view, center = _pack_camera(camera, dilation)
-        records, bounds = np.empty((n, RECORD_SIZE), np.float32), np.empty((n, 4), np.int32)
+        records = _new_records(n)
+        bounds = records.view(np.int32)[:, -4:]
         run_parts(_prepare_part, means, rotations, scales, opacities, harmonics, directions,
                   view, center, width, height, records, bounds)  # fmt: skip
-        tiles_x, tiles_y = -(-width // TILE_WIDTH), -(-height // TILE_HEIGHT)
-        tile_starts, entries, slots, slot_starts = bin_splats(
-            records, bounds, tiles_x, tiles_y, TILE_WIDTH, TILE_HEIGHT
-        )
+        tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
+        tile_starts, pairs, splat_starts, places = _bin(records, bounds, tiles_x, tiles_y)
         outputs = torch.empty(height, width, 3), torch.empty(height, width), torch.empty(height, width)
         images = [output.numpy() for output in outputs]
-        run_parts(composite_part, records, tile_starts, entries, tiles_x, background, *images)
+        run_parts(composite_part, records, tile_starts, pairs, tiles_x, background, *images)
         ctx.save_for_backward(*tensors, *outputs)
         ctx.splats = records, bounds, view, center
-        ctx.bins = tile_starts, entries, slots, slot_starts, tiles_x
+        ctx.bins = tile_starts, pairs, splat_starts, places, tiles_x
         return outputs
 
     @staticmethod
@@ -101,24 +106,55 @@ class _Rasterize(torch.autograd.Function):
         *tensors, color, alpha, depth = ctx.saved_tensors
         arrays = [*map(_as_array, tensors[:5]), _as_array(tensors[5], _NO_DIRECTIONS)]
         records, bounds, view, center = ctx.splats
-        tile_starts, entries, slots, slot_starts, tiles_x = ctx.bins
+        tile_starts, pairs, splat_starts, places, tiles_x = ctx.bins
         height, width = alpha.shape
         images = color.numpy(), alpha.numpy(), depth.numpy()
         v_color, v_alpha, v_depth = map(_as_array, v_outputs, (_NO_COLOR, _NO_IMAGE, _NO_IMAGE))
-        slot_sums = np.empty((len(slots), SUMS_SIZE), np.float32)
-        run_parts(composite_backward_part, records, tile_starts, entries, slots, tiles_x, *images,
-                  v_color, v_alpha, v_depth, slot_sums)  # fmt: skip
+        pair_sums = np.empty((len(pairs), SUMS_SIZE), np.float32)
+        run_parts(composite_backward_part, records, tile_starts, pairs, tiles_x, *images,
+                  v_color, v_alpha, v_depth, pair_sums)  # fmt: skip
         # Zeros from NumPy: torch would fill them with OpenMP threads, which then spin on the cores we need.
         gradients = [np.zeros(array.shape, np.float32) for array in arrays]
         sums = np.empty((len(bounds), SUMS_SIZE), np.float32)
-        run_parts(_finish_part, *arrays, view, center, width, height, bounds, slot_starts, slot_sums, sums,
-                  *gradients)  # fmt: skip
+        run_parts(_finish_part, *arrays, view, center, width, height, bounds, splat_starts, places, pair_sums,
+                  sums, *gradients)  # fmt: skip
         v_inputs = [torch.from_numpy(gradient) for gradient in gradients]
         v_directions = None if tensors[5] is None else v_inputs[5]
         v_background = None
         if ctx.needs_input_grad[6] and v_outputs[0] is not None:
             v_background = torch.einsum("hw,hwc->c", 1 - alpha, v_outputs[0])
         return *v_inputs[:5], v_directions, v_background, None, None
+
+
+def _new_records(count: int) -> np.ndarray:
+    """Return room for the records of splats, each of which fills a cache line and ends with its bounds.
+
+    From NumPy, which asks for huge pages: in order of depth records are read from all over, and with small
+    pages finding them takes longer than reading them.
+    """
+    lines = np.empty((count + 1) * RECORD_SIZE, np.float32)
+    first = -lines.ctypes.data % (4 * RECORD_SIZE) // 4
+    return lines[first : first + count * RECORD_SIZE].reshape(count, RECORD_SIZE)
+
+
+def _bin(records: np.ndarray, bounds: np.ndarray, tiles_x: int, tiles_y: int) -> tuple[np.ndarray, ...]:
+    """Return each tile's list of splats, front to back.
+
+    Returns:
+        tile_starts: [tiles + 1] where each tile's list starts.
+        pairs: [p, 2] splat, and set of the tile's blocks that it touches.
+        splat_starts: [n + 1] where each splat's places start.
+        places: [p] of each splat's pairs.
+    """
+    order = sort_by_depth(records, bounds)
+    cursors = np.empty((part_count(), tiles_x * tiles_y), np.int32)
+    tiles = np.zeros(len(bounds), np.int32)
+    run_parts(count_pairs_part, order, records, bounds, tiles_x, cursors, tiles)
+    tile_starts, splat_starts = place_pairs(cursors, tiles)
+    pairs, places = np.empty((tile_starts[-1], 2), np.int32), np.empty(tile_starts[-1], np.int32)
+    run_parts(deal_pairs_part, order, records, bounds, tiles_x, FIRST_ROWS, cursors, splat_starts,
+              pairs, places)  # fmt: skip
+    return tile_starts, pairs, splat_starts, places
 
 
 def _prepare_part(
@@ -132,11 +168,11 @@ def _prepare_part(
 
 def _finish_part(
     part, parts, means, rotations, scales, opacities, harmonics, directions,
-    view, center, width, height, bounds, slot_starts, slot_sums, sums,
+    view, center, width, height, bounds, splat_starts, places, pair_sums, sums,
     v_means, v_rotations, v_scales, v_opacities, v_harmonics, v_directions,
 ):  # fmt: skip
     """Bring the gradients of one part's splats back to their Gaussians."""
-    gather_slots_part(part, parts, slot_starts, slot_sums, sums)
+    gather_sums_part(part, parts, splat_starts, places, pair_sums, sums)
     project_backward_part(part, parts, means, rotations, scales, opacities, view, width, height,
                           bounds, sums, v_means, v_rotations, v_scales, v_opacities)  # fmt: skip
     shade_backward_part(part, parts, means, harmonics, directions, center,

@@ -1,21 +1,40 @@
-"""Numba kernels: which splats touch which tile, front to back, and where their gradients meet again.
+"""Numba kernels: which splats touch which blocks of which tile, front to back; where gradients meet again.
 
 Splats are sorted by depth once for the whole image; dealing them out to the tiles in that order leaves every
-tile's list sorted. Each (tile, splat) pair owns one slot of the backward pass, and the slots of a splat lie
-together: tiles write without meeting, and the sum runs in one fixed order, so gradients are deterministic.
+tile's list sorted. A (tile, splat) pair is two numbers, the splat and the set of the tile's blocks that it
+touches. The backward pass leaves sums with every pair; each splat knows the places of its pairs: tiles write
+without meeting, and sums run in one fixed order, so gradients are deterministic.
+
+Several parts deal at once: each takes a stretch of the sorted splats, and counting first tells every part
+where in each tile's list its own begin.
 """
+
+import math
 
 import numpy as np
 
+from dsar.raster.conventions import ALPHA_MIN
 from dsar.raster.jit import inlined, kernel
+from dsar.raster.simd import LANES, bits_of, larger, load, prefetch, smaller, spread, square_root
+from dsar.raster.tiles import BLOCK_HEIGHT, BLOCK_WIDTH, COLUMNS, STRIPS, TILE
+
+FIRST_ROWS = np.array([BLOCK_HEIGHT * strip + 0.5 for strip in range(LANES)], np.float32)
+"""Centre of each strip's first pixel row, from the tile's top; lanes beyond the last strip are not used."""
 
 _RADIX_BITS = 11
 _RADIX = 1 << _RADIX_BITS
+# How many splats ahead a record is fetched: in order of depth they lie all over the memory.
+_AHEAD = 8
+_LOG_ALPHA_MIN = np.float32(math.log2(ALPHA_MIN))
+_ALL_STRIPS = np.uint32((1 << STRIPS) - 1)
+_ZERO, _HALF = np.float32(0), np.float32(0.5)
+# Pixels by which a splat's outline is widened, so that rounding never costs it a block.
+_SLACK = np.float32(0.01)
 
 
-@inlined
-def _sort_by_depth(records, bounds):
-    """Return the indices of visible splats front to back, ties by index (radix sort; depths are positive)."""
+@kernel
+def sort_by_depth(records, bounds):
+    """Return the indices of drawn splats front to back, ties by index (radix sort; depths are positive)."""
     n = len(bounds)
     ids, depths = np.empty(n, np.int32), np.empty(n, np.float32)
     count = 0
@@ -39,51 +58,124 @@ def _sort_by_depth(records, bounds):
     return ids
 
 
+@inlined
+def _fetch_ahead(records, order, k):
+    """Have the record of a splat that is due soon brought into the cache."""
+    if k + _AHEAD < len(order):
+        prefetch(records, np.uint64(order[k + _AHEAD]) * np.uint64(16))
+
+
+@inlined
+def _tile_span(bounds, i):
+    """Return the first and end tile column and the first and end tile row that a splat touches."""
+    return (
+        bounds[i, 0] // TILE,
+        (bounds[i, 1] - 1) // TILE + 1,
+        bounds[i, 2] // TILE,
+        (bounds[i, 3] - 1) // TILE + 1,
+    )
+
+
 @kernel
-def bin_splats(records, bounds, tiles_x, tiles_y, tile_width, tile_height):
-    """Return the splats of every tile, front to back.
+def count_pairs_part(part, parts, order, records, bounds, tiles_x, counts, tiles):
+    """Count the splats that one part will deal to every tile (counts[part]), and the tiles of each splat."""
+    n, flat = len(order), records.reshape(-1)
+    counts[part] = 0
+    for k in range(n * part // parts, n * (part + 1) // parts):
+        _fetch_ahead(flat, order, k)
+        i = order[k]
+        x0, x1, y0, y1 = _tile_span(bounds, i)
+        tiles[i] = (x1 - x0) * (y1 - y0)
+        for row in range(y0, y1):
+            for tile in range(row * tiles_x + x0, row * tiles_x + x1):
+                counts[part, tile] += 1
+
+
+@kernel
+def place_pairs(counts, tiles):
+    """Turn counts into where each part begins in each tile's list.
 
     Returns:
-        tile_starts: [tiles + 1] where each tile's list starts in `entries`.
-        entries: splat index of every (tile, splat) pair.
-        slots: the pair's place in the slot buffer of the backward pass.
-        slot_starts: [n + 1] where each splat's slots start.
+        tile_starts: [tiles + 1] where each tile's pairs start.
+        splat_starts: [n + 1] where each splat's places start.
     """
-    n = len(bounds)
-    order = _sort_by_depth(records, bounds)
-    tile_starts, slot_starts = np.zeros(tiles_x * tiles_y + 1, np.int32), np.zeros(n + 1, np.int32)
-    spans = np.empty((n, 4), np.int32)
-    for i in range(n):
-        if bounds[i, 1] > 0:
-            spans[i, 0], spans[i, 1] = bounds[i, 0] // tile_width, (bounds[i, 1] - 1) // tile_width + 1
-            spans[i, 2], spans[i, 3] = bounds[i, 2] // tile_height, (bounds[i, 3] - 1) // tile_height + 1
-            for row in range(spans[i, 2], spans[i, 3]):
-                for column in range(spans[i, 0], spans[i, 1]):
-                    tile_starts[row * tiles_x + column + 1] += 1
-            slot_starts[i + 1] = (spans[i, 1] - spans[i, 0]) * (spans[i, 3] - spans[i, 2])
-        slot_starts[i + 1] += slot_starts[i]
-    for tile in range(tiles_x * tiles_y):
-        tile_starts[tile + 1] += tile_starts[tile]
-    entries, slots = np.empty(slot_starts[n], np.int32), np.empty(slot_starts[n], np.int32)
-    cursors = tile_starts[:-1].copy()
-    for i in order:
-        slot = slot_starts[i]
-        for row in range(spans[i, 2], spans[i, 3]):
-            for column in range(spans[i, 0], spans[i, 1]):
-                position = cursors[row * tiles_x + column]
-                cursors[row * tiles_x + column] = position + 1
-                entries[position], slots[position] = i, slot
-                slot += 1
-    return tile_starts, entries, slots, slot_starts
+    tile_starts, splat_starts = np.empty(counts.shape[1] + 1, np.int32), np.empty(len(tiles) + 1, np.int32)
+    total = np.int32(0)
+    for tile in range(counts.shape[1]):
+        tile_starts[tile] = total
+        for part in range(len(counts)):
+            count = counts[part, tile]
+            counts[part, tile] = total
+            total += count
+    tile_starts[-1] = total
+    splat_starts[0] = 0
+    for i in range(len(tiles)):
+        splat_starts[i + 1] = splat_starts[i] + tiles[i]
+    return tile_starts, splat_starts
+
+
+@inlined
+def _outline(records, i, top, first_rows):
+    """Return where the splat's outline begins and ends in each strip of a tile (x, infinite if it does not).
+
+    The outline alpha = ALPHA_MIN is e1² + e2² = reach². At a given dy = mean y - pixel y it spans
+    dx = (shear dy ± sqrt(reach² - e2²)) / stretch, and most where dy is ± shear reach / (height
+    hypot(height, shear)).
+    """
+    stretch, shear, height = records[i, 2], records[i, 3], records[i, 4]
+    squared = max(records[i, 5] - _LOG_ALPHA_MIN, _ZERO)
+    reach = math.sqrt(squared)
+    lift = shear * reach / (height * math.sqrt(height * height + shear * shear))
+    limit = spread(reach / height)
+    highest = records[i, 1] - top - load(first_rows, np.uint64(0))
+    lowest = highest - np.float32(BLOCK_HEIGHT - 1)
+    touched = (lowest - _SLACK <= limit) & (highest + _SLACK >= _ZERO - limit)
+    low, high = larger(lowest, _ZERO - limit), smaller(highest, limit)
+    right, left = smaller(larger(spread(lift), low), high), smaller(larger(spread(-lift), low), high)
+    width = np.float32(1) / stretch
+    reach_right = square_root(larger(squared - height * height * right * right, spread(_ZERO)))
+    reach_left = square_root(larger(squared - height * height * left * left, spread(_ZERO)))
+    begin = records[i, 0] - (shear * right + reach_right) * width - _SLACK
+    end = records[i, 0] - (shear * left - reach_left) * width + _SLACK
+    return begin, end, touched
 
 
 @kernel
-def gather_slots_part(part, parts, slot_starts, slot_sums, sums):
-    """Add up each splat's slots."""
-    n = len(slot_starts) - 1
+def deal_pairs_part(
+    part, parts, order, records, bounds, tiles_x, first_rows, cursors, splat_starts, pairs, places
+):
+    """Write one part's pairs into the tiles' lists, and their places with the splats."""
+    n, flat = len(order), records.reshape(-1)
+    for k in range(n * part // parts, n * (part + 1) // parts):
+        _fetch_ahead(flat, order, k)
+        i = order[k]
+        x0, x1, y0, y1 = _tile_span(bounds, i)
+        own = splat_starts[i]
+        for row in range(y0, y1):
+            begin, end, touched = _outline(records, i, np.float32(row * TILE), first_rows)
+            for column in range(x0, x1):
+                left = np.float32(column * TILE) + _HALF
+                blocks = np.uint32(0)
+                for block in range(COLUMNS):
+                    first = left + np.float32(block * BLOCK_WIDTH)
+                    meets = touched & (begin <= first + np.float32(BLOCK_WIDTH - 1)) & (end >= first)
+                    blocks |= (bits_of(meets) & _ALL_STRIPS) << np.uint32(block * STRIPS)
+                place = cursors[part, row * tiles_x + column]
+                cursors[part, row * tiles_x + column] = place + 1
+                pairs[place, 0], pairs[place, 1] = i, blocks
+                places[own] = place
+                own += 1
+
+
+@kernel
+def gather_sums_part(part, parts, splat_starts, places, pair_sums, sums):
+    """Add up the sums of each splat's pairs."""
+    n, flat = len(splat_starts) - 1, pair_sums.reshape(-1)
     for i in range(n * part // parts, n * (part + 1) // parts):
         for k in range(sums.shape[1]):
-            sums[i, k] = np.float32(0)
-        for slot in range(slot_starts[i], slot_starts[i + 1]):
+            sums[i, k] = _ZERO
+        for own in range(splat_starts[i], splat_starts[i + 1]):
+            if own + _AHEAD < len(places):
+                prefetch(flat, np.uint64(places[own + _AHEAD]) * np.uint64(sums.shape[1]))
             for k in range(sums.shape[1]):
-                sums[i, k] += slot_sums[slot, k]
+                sums[i, k] += pair_sums[places[own], k]

@@ -1,15 +1,18 @@
 """Numba kernels: Gaussians in the world to splats on the image, and the way back.
 
-A splat's fall-off is kept as the Cholesky factor of its inverse covariance. With d = mean - pixel:
+A splat's fall-off is kept as the Cholesky factor of its inverse covariance, in powers of two. With
+d = mean - pixel:
 
-    e1 = stretch dx - shear dy,  e2 = height dy,  alpha = opacity exp(-(e1² + e2²)).
+    e1 = stretch dx - shear dy,  e2 = height dy,  log2 alpha = log2 opacity - e1² - e2².
 
 Unlike the conic (a, b, c) this cannot turn negative by rounding, however thin the splat. A splat's record is
-mean x, mean y, stretch, shear, height, opacity, red, green, blue, z, first row, end row; the colour is left
-to kernels_shading. Bounds are the pixels first x, end x, first y, end y; all 0 if a Gaussian is not drawn.
+mean x, mean y, stretch, shear, height, log2 opacity, red, green, blue, z (two are not used) and, as integers,
+its bounds: pixels first x, end x, first y, end y, all 0 if the Gaussian is not drawn; a cache line in all.
+The colour is left to kernels_shading.
 
-Every kernel takes `part` of `parts` and touches only those rows, so results do not depend on their number.
-The camera is 17 numbers: rotation (row-major 9), translation (3), fx, fy, cx, cy, and the splats' dilation.
+Gaussians go through LANES at a time: their rows are first laid out as planes of a scratch array. Every kernel
+takes `part` of `parts` and touches only those rows, so results do not depend on their number. The camera is
+17 numbers: rotation (row-major 9), translation (3), fx, fy, cx, cy, and the splats' dilation.
 """
 
 import math
@@ -18,13 +21,31 @@ import numpy as np
 
 from dsar.raster.conventions import ALPHA_MIN, FRUSTUM_MARGIN, NEAR
 from dsar.raster.jit import inlined, kernel
+from dsar.raster.simd import (
+    LANES,
+    choose,
+    larger,
+    load,
+    log_two,
+    round_down,
+    smaller,
+    spread,
+    square_root,
+    store,
+)
 
-RECORD_SIZE = 12
+RECORD_SIZE = 16
 _NEAR = np.float32(NEAR)
 _MARGIN = np.float32(0.5 * FRUSTUM_MARGIN)
 _ALPHA_MIN = np.float32(ALPHA_MIN)
+_LOG_ALPHA_MIN = np.float32(math.log2(ALPHA_MIN))
+_LOG2_E, _LN_2 = np.float32(math.log2(math.e)), np.float32(math.log(2))
 _LARGEST = np.finfo(np.float32).max
 _ZERO, _HALF, _ONE, _TWO = (np.float32(value) for value in (0.0, 0.5, 1.0, 2.0))
+# Scratch planes: what comes in (mean, rotation, scales, opacity, then the sums of the backward pass) ...
+_MEAN, _ROTATION, _SCALES, _OPACITY, _SUMS = 0, 3, 7, 10, 11
+# ... and, over it, what goes out: records and bounds, or gradients in the order of the inputs.
+_BOUNDS, _PLANES = 10, 21
 
 
 @inlined
@@ -39,11 +60,39 @@ def _row(matrix, start):
 
 
 @inlined
-def _unit_quaternion(rotations, i):
-    """Return one quaternion normalised, and the inverse of its norm (infinite for a zero quaternion)."""
-    w, x, y, z = rotations[i, 0], rotations[i, 1], rotations[i, 2], rotations[i, 3]
-    squared = w * w + x * x + y * y + z * z
-    inverse = _ONE / math.sqrt(squared) if squared > _ZERO else np.float32(np.inf)
+def _plane(scratch, index):
+    return load(scratch, np.uint64(index * LANES))
+
+
+@inlined
+def _planes(scratch, index):
+    """Return three consecutive planes."""
+    return _plane(scratch, index), _plane(scratch, index + 1), _plane(scratch, index + 2)
+
+
+@inlined
+def _write(scratch, index, values):
+    store(scratch, np.uint64(index * LANES), values)
+
+
+@inlined
+def _lay_out(scratch, start, end, means, rotations, scales, opacities):
+    """Copy LANES rows into the scratch planes; the last row stands in for those beyond the end."""
+    for lane in range(LANES):
+        i = min(start + lane, end - 1)
+        for k in range(3):
+            scratch[(_MEAN + k) * LANES + lane] = means[i, k]
+            scratch[(_SCALES + k) * LANES + lane] = scales[i, k]
+        for k in range(4):
+            scratch[(_ROTATION + k) * LANES + lane] = rotations[i, k]
+        scratch[_OPACITY * LANES + lane] = opacities[i]
+
+
+@inlined
+def _unit_quaternion(scratch):
+    """Return quaternions normalised, and the inverses of their norms (infinite for a zero quaternion)."""
+    w, (x, y, z) = _plane(scratch, _ROTATION), _planes(scratch, _ROTATION + 1)
+    inverse = _ONE / square_root(w * w + x * x + y * y + z * z)
     return w * inverse, x * inverse, y * inverse, z * inverse, inverse
 
 
@@ -58,9 +107,8 @@ def _rotation_rows(w, x, y, z):
 
 
 @inlined
-def _camera_point(means, camera, i):
-    """Return one mean in camera coordinates, metres."""
-    mean = (means[i, 0], means[i, 1], means[i, 2])
+def _camera_point(mean, camera):
+    """Return means in camera coordinates, metres."""
     return (
         _dot(_row(camera, 0), mean) + camera[9],
         _dot(_row(camera, 3), mean) + camera[10],
@@ -70,18 +118,18 @@ def _camera_point(means, camera, i):
 
 @inlined
 def _clamped_tangent(tangent, focal, center, size):
-    """Return x/z limited to the widened image: beyond it the linearised projection explodes."""
+    """Return x/z limited to the widened image (beyond, linearising explodes), and where it was inside."""
     margin = _MARGIN * size / focal
-    return min(max(tangent, -center / focal - margin), (size - center) / focal + margin)
+    low, high = -center / focal - margin, (size - center) / focal + margin
+    return smaller(larger(tangent, spread(low)), spread(high)), (tangent >= low) & (tangent <= high)
 
 
 @inlined
 def _image_axes(point, camera, width, height):
     """Return d(pixel x)/d(world), d(pixel y)/d(world), and whether each was linearised at the mean itself."""
     inverse_z = _ONE / point[2]
-    tan_x, tan_y = point[0] * inverse_z, point[1] * inverse_z
-    tx = _clamped_tangent(tan_x, camera[12], camera[14], width)
-    ty = _clamped_tangent(tan_y, camera[13], camera[15], height)
+    tx, free_x = _clamped_tangent(point[0] * inverse_z, camera[12], camera[14], width)
+    ty, free_y = _clamped_tangent(point[1] * inverse_z, camera[13], camera[15], height)
     fx, fy = camera[12] * inverse_z, camera[13] * inverse_z
     right, down, forward = _row(camera, 0), _row(camera, 3), _row(camera, 6)
     u1 = (
@@ -94,7 +142,7 @@ def _image_axes(point, camera, width, height):
         fy * (down[1] - ty * forward[1]),
         fy * (down[2] - ty * forward[2]),
     )
-    return u1, u2, tx == tan_x, ty == tan_y
+    return u1, u2, free_x, free_y
 
 
 @inlined
@@ -108,8 +156,8 @@ def _times_matrix(u, rows):
 
 
 @inlined
-def _scaled(g, scales, i):
-    return g[0] * scales[i, 0], g[1] * scales[i, 1], g[2] * scales[i, 2]
+def _scaled(g, scales):
+    return g[0] * scales[0], g[1] * scales[1], g[2] * scales[2]
 
 
 @inlined
@@ -130,9 +178,47 @@ def _covariance(m1, m2, dilation):
 @inlined
 def _pixel_range(center, radius, size):
     """Return the first and end index of the pixels whose centres lie within a radius, inside the image."""
-    first = min(max(math.ceil(center - radius - _HALF), _ZERO), size)
-    end = min(max(math.floor(center + radius + _HALF), _ZERO), size)
-    return np.int32(first), np.int32(end)
+    first = -round_down(radius + _HALF - center)
+    end = round_down(center + radius + _HALF)
+    return smaller(larger(first, spread(_ZERO)), spread(size)), smaller(
+        larger(end, spread(_ZERO)), spread(size)
+    )
+
+
+@inlined
+def _project(scratch, camera, width, height):
+    """Replace Gaussians in the scratch planes by their records and bounds."""
+    mean, scales, opacity = _planes(scratch, _MEAN), _planes(scratch, _SCALES), _plane(scratch, _OPACITY)
+    point = _camera_point(mean, camera)
+    w, x, y, z, _ = _unit_quaternion(scratch)
+    rows = _rotation_rows(w, x, y, z)
+    u1, u2, _, _ = _image_axes(point, camera, width, height)
+    m1, m2 = _scaled(_times_matrix(u1, rows), scales), _scaled(_times_matrix(u2, rows), scales)
+    a, b, c, slim = _covariance(m1, m2, camera[16])
+    mean_x = camera[12] * point[0] / point[2] + camera[14]
+    mean_y = camera[13] * point[1] / point[2] + camera[15]
+    log_opacity = log_two(opacity)
+    # Alpha is at least ALPHA_MIN within this many variances, squared, of the mean.
+    reach = (_TWO * _LN_2) * (log_opacity - _LOG_ALPHA_MIN) + np.float32(1e-4)
+    x0, x1 = _pixel_range(mean_x, square_root(reach * a), width)
+    y0, y1 = _pixel_range(mean_y, square_root(reach * c), height)
+    # Comparisons with NaN fail, and so does one with an infinite or NaN sum.
+    finite = mean_x + mean_y + a + c + slim + opacity
+    drawn = (point[2] > _NEAR) & (opacity >= _ALPHA_MIN) & (finite <= _LARGEST) & (finite >= -_LARGEST)
+    drawn = drawn & (smaller(smaller(scales[0], scales[1]), scales[2]) > _ZERO) & (x0 < x1) & (y0 < y1)
+    stretch = square_root(_HALF * _LOG2_E / slim)
+    _write(scratch, 0, mean_x)
+    _write(scratch, 1, mean_y)
+    _write(scratch, 2, stretch)
+    _write(scratch, 3, stretch * b / c)
+    _write(scratch, 4, square_root(_HALF * _LOG2_E / c))
+    _write(scratch, 5, log_opacity)
+    _write(scratch, 9, point[2])
+    nothing = spread(_ZERO)
+    _write(scratch, _BOUNDS, choose(drawn, x0, nothing))
+    _write(scratch, _BOUNDS + 1, choose(drawn, x1, nothing))
+    _write(scratch, _BOUNDS + 2, choose(drawn, y0, nothing))
+    _write(scratch, _BOUNDS + 3, choose(drawn, y1, nothing))
 
 
 @kernel
@@ -140,52 +226,36 @@ def project_part(part, parts, means, rotations, scales, opacities, camera, width
     """Write the records (all but colours) and bounds of one part of the Gaussians."""
     n = len(means)
     width, height = np.float32(width), np.float32(height)
-    for i in range(n * part // parts, n * (part + 1) // parts):
-        bounds[i, 0] = bounds[i, 1] = bounds[i, 2] = bounds[i, 3] = 0
-        opacity = opacities[i]
-        point = _camera_point(means, camera, i)
-        smallest = min(scales[i, 0], scales[i, 1], scales[i, 2])
-        if not (point[2] > _NEAR and opacity >= _ALPHA_MIN and smallest > _ZERO):
-            continue
-        w, x, y, z, _ = _unit_quaternion(rotations, i)
-        rows = _rotation_rows(w, x, y, z)
-        u1, u2, _, _ = _image_axes(point, camera, width, height)
-        m1, m2 = _scaled(_times_matrix(u1, rows), scales, i), _scaled(_times_matrix(u2, rows), scales, i)
-        a, b, c, slim = _covariance(m1, m2, camera[16])
-        mean_x = camera[12] * point[0] / point[2] + camera[14]
-        mean_y = camera[13] * point[1] / point[2] + camera[15]
-        # Not math.isfinite: it subtracts the value from itself, which the compiler may fold to zero.
-        if not abs(mean_x + mean_y + a + c + slim + opacity) <= _LARGEST:
-            continue
-        # The splat's alpha is at least ALPHA_MIN exactly where e1² + e2² <= log(opacity / ALPHA_MIN).
-        reach = _TWO * math.log(opacity / _ALPHA_MIN) + np.float32(1e-4)
-        x0, x1 = _pixel_range(mean_x, math.sqrt(reach * a), width)
-        y0, y1 = _pixel_range(mean_y, math.sqrt(reach * c), height)
-        if x0 >= x1 or y0 >= y1:
-            continue
-        bounds[i, 0], bounds[i, 1], bounds[i, 2], bounds[i, 3] = x0, x1, y0, y1
-        stretch = _ONE / math.sqrt(_TWO * slim)
-        records[i, 0], records[i, 1] = mean_x, mean_y
-        records[i, 2], records[i, 3] = stretch, stretch * b / c
-        records[i, 4], records[i, 5] = _ONE / math.sqrt(_TWO * c), opacity
-        records[i, 9], records[i, 10], records[i, 11] = point[2], np.float32(y0), np.float32(y1)
+    scratch = np.empty(_PLANES * LANES, np.float32)
+    end = n * (part + 1) // parts
+    for start in range(n * part // parts, end, LANES):
+        _lay_out(scratch, start, end, means, rotations, scales, opacities)
+        _project(scratch, camera, width, height)
+        for lane in range(min(LANES, end - start)):
+            for k in range(_BOUNDS):
+                records[start + lane, k] = scratch[k * LANES + lane]
+            for k in range(4):
+                bounds[start + lane, k] = np.int32(scratch[(_BOUNDS + k) * LANES + lane])
 
 
 @inlined
-def _splat_gradient(sums, i, a, b, c, slim):
+def _splat_gradient(scratch, a, b, c, slim):
     """Return dL/d(mean x, mean y, A, B, C) from a splat's sums over its pixels (see kernels_compositing)."""
-    stretch, height, ratio = _ONE / math.sqrt(_TWO * slim), _ONE / math.sqrt(_TWO * c), b / c
-    v_x = _TWO * stretch * sums[i, 1]
-    v_y = _TWO * (height * sums[i, 2] - ratio * stretch * sums[i, 1])
-    v_slim = -sums[i, 3] / slim
-    v_ratio = -_TWO * stretch / height * sums[i, 4]
+    stretch, height, ratio = square_root(_HALF * _LOG2_E / slim), square_root(_HALF * _LOG2_E / c), b / c
+    # The sums are of powers of e, the factors in powers of two.
+    v_e1, v_e2 = (_TWO * _LN_2) * _plane(scratch, _SUMS + 1), (_TWO * _LN_2) * _plane(scratch, _SUMS + 2)
+    v_e11, v_e12, v_e22 = _planes(scratch, _SUMS + 3)
+    v_x = stretch * v_e1
+    v_y = height * v_e2 - ratio * stretch * v_e1
+    v_slim = -(_LN_2 * v_e11 / slim)
+    v_ratio = -((_TWO * _LN_2) * stretch / height * v_e12)
     v_b = v_ratio / c - _TWO * v_slim * ratio
-    v_c = v_slim * ratio * ratio - (v_ratio * ratio + sums[i, 5]) / c
+    v_c = v_slim * ratio * ratio - (v_ratio * ratio + _LN_2 * v_e22) / c
     return v_x, v_y, v_slim, v_b, v_c
 
 
 @inlined
-def _write_rotation_gradient(u1, u2, v_g1, v_g2, quaternion, v_rotations, i):
+def _write_rotation_gradient(scratch, u1, u2, v_g1, v_g2, quaternion):
     """Chain dL/dR = u1ᵀ v_g1 + u2ᵀ v_g2 through the quaternion and its normalisation."""
     w, x, y, z, inverse = quaternion
     v00, v11, v22 = (
@@ -201,29 +271,64 @@ def _write_rotation_gradient(u1, u2, v_g1, v_g2, quaternion, v_rotations, i):
     v_y = x * (v01 + v10) + z * (v12 + v21) - _TWO * y * (v00 + v22) + w * (v02 - v20)
     v_z = x * (v02 + v20) + y * (v12 + v21) - _TWO * z * (v00 + v11) + w * (v10 - v01)
     radial = w * v_w + x * v_x + y * v_y + z * v_z
-    v_rotations[i, 0] = _TWO * inverse * (v_w - w * radial)
-    v_rotations[i, 1] = _TWO * inverse * (v_x - x * radial)
-    v_rotations[i, 2] = _TWO * inverse * (v_y - y * radial)
-    v_rotations[i, 3] = _TWO * inverse * (v_z - z * radial)
+    twice = _TWO * inverse
+    _write(scratch, _ROTATION, twice * (v_w - w * radial))
+    _write(scratch, _ROTATION + 1, twice * (v_x - x * radial))
+    _write(scratch, _ROTATION + 2, twice * (v_y - y * radial))
+    _write(scratch, _ROTATION + 3, twice * (v_z - z * radial))
 
 
 @inlined
-def _write_mean_gradient(point, camera, u1, u2, free_x, free_y, v_u1, v_u2, v_x, v_y, v_depth, v_means, i):
+def _write_mean_gradient(scratch, point, camera, u1, u2, free_x, free_y, v_u1, v_u2, v_x, v_y):
     """Chain dL/d(image axes, mean on the image, depth) to the mean in the world."""
     inverse_z = _ONE / point[2]
     fx, fy, forward = camera[12] * inverse_z, camera[13] * inverse_z, _row(camera, 6)
-    v_tx, v_ty = -fx * _dot(v_u1, forward), -fy * _dot(v_u2, forward)
     # A clamped tangent is a constant of the linearisation.
-    v_tx = v_tx if free_x else _ZERO
-    v_ty = v_ty if free_y else _ZERO
+    v_tx = choose(free_x, -(fx * _dot(v_u1, forward)), spread(_ZERO))
+    v_ty = choose(free_y, -(fy * _dot(v_u2, forward)), spread(_ZERO))
     v_right = (camera[12] * v_x + v_tx) * inverse_z
     v_down = (camera[13] * v_y + v_ty) * inverse_z
     # u1 and u2 are proportional to 1/z, and so are the tangents.
     v_log_z = _dot(v_u1, u1) + _dot(v_u2, u2) + v_right * point[0] + v_down * point[1]
-    v_forward = v_depth - v_log_z * inverse_z
+    v_forward = _plane(scratch, _SUMS + 9) - v_log_z * inverse_z
     right, down = _row(camera, 0), _row(camera, 3)
     for axis in range(3):
-        v_means[i, axis] = right[axis] * v_right + down[axis] * v_down + forward[axis] * v_forward
+        v_mean = right[axis] * v_right + down[axis] * v_down + forward[axis] * v_forward
+        _write(scratch, _MEAN + axis, v_mean)
+
+
+@inlined
+def _project_backward(scratch, camera, width, height):
+    """Replace Gaussians in the scratch planes by their gradients."""
+    mean, scales, opacity = _planes(scratch, _MEAN), _planes(scratch, _SCALES), _plane(scratch, _OPACITY)
+    point = _camera_point(mean, camera)
+    quaternion = _unit_quaternion(scratch)
+    rows = _rotation_rows(quaternion[0], quaternion[1], quaternion[2], quaternion[3])
+    u1, u2, free_x, free_y = _image_axes(point, camera, width, height)
+    g1, g2 = _times_matrix(u1, rows), _times_matrix(u2, rows)
+    m1, m2 = _scaled(g1, scales), _scaled(g2, scales)
+    a, b, c, slim = _covariance(m1, m2, camera[16])
+    v_x, v_y, v_a, v_b, v_c = _splat_gradient(scratch, a, b, c, slim)
+    twice_a, twice_c = _TWO * v_a, _TWO * v_c
+    v_m1 = (
+        twice_a * m1[0] + v_b * m2[0],
+        twice_a * m1[1] + v_b * m2[1],
+        twice_a * m1[2] + v_b * m2[2],
+    )
+    v_m2 = (
+        twice_c * m2[0] + v_b * m1[0],
+        twice_c * m2[1] + v_b * m1[1],
+        twice_c * m2[2] + v_b * m1[2],
+    )
+    _write(scratch, _SCALES, v_m1[0] * g1[0] + v_m2[0] * g2[0])
+    _write(scratch, _SCALES + 1, v_m1[1] * g1[1] + v_m2[1] * g2[1])
+    _write(scratch, _SCALES + 2, v_m1[2] * g1[2] + v_m2[2] * g2[2])
+    v_g1, v_g2 = _scaled(v_m1, scales), _scaled(v_m2, scales)
+    _write_rotation_gradient(scratch, u1, u2, v_g1, v_g2, quaternion)
+    v_u1 = (_dot(rows[0], v_g1), _dot(rows[1], v_g1), _dot(rows[2], v_g1))
+    v_u2 = (_dot(rows[0], v_g2), _dot(rows[1], v_g2), _dot(rows[2], v_g2))
+    _write_mean_gradient(scratch, point, camera, u1, u2, free_x, free_y, v_u1, v_u2, v_x, v_y)
+    _write(scratch, _OPACITY, -(_plane(scratch, _SUMS) / opacity))
 
 
 @kernel
@@ -234,34 +339,21 @@ def project_backward_part(
     """Write the gradients of one part of the Gaussians; those that were not drawn keep what is there."""
     n = len(means)
     width, height = np.float32(width), np.float32(height)
-    for i in range(n * part // parts, n * (part + 1) // parts):
-        if bounds[i, 1] == 0:
-            continue
-        point = _camera_point(means, camera, i)
-        quaternion = _unit_quaternion(rotations, i)
-        rows = _rotation_rows(quaternion[0], quaternion[1], quaternion[2], quaternion[3])
-        u1, u2, free_x, free_y = _image_axes(point, camera, width, height)
-        g1, g2 = _times_matrix(u1, rows), _times_matrix(u2, rows)
-        m1, m2 = _scaled(g1, scales, i), _scaled(g2, scales, i)
-        a, b, c, slim = _covariance(m1, m2, camera[16])
-        v_x, v_y, v_a, v_b, v_c = _splat_gradient(sums, i, a, b, c, slim)
-        v_m1 = (
-            _TWO * v_a * m1[0] + v_b * m2[0],
-            _TWO * v_a * m1[1] + v_b * m2[1],
-            _TWO * v_a * m1[2] + v_b * m2[2],
-        )
-        v_m2 = (
-            _TWO * v_c * m2[0] + v_b * m1[0],
-            _TWO * v_c * m2[1] + v_b * m1[1],
-            _TWO * v_c * m2[2] + v_b * m1[2],
-        )
-        for axis in range(3):
-            v_scales[i, axis] = v_m1[axis] * g1[axis] + v_m2[axis] * g2[axis]
-        v_g1, v_g2 = _scaled(v_m1, scales, i), _scaled(v_m2, scales, i)
-        _write_rotation_gradient(u1, u2, v_g1, v_g2, quaternion, v_rotations, i)
-        v_u1 = (_dot(rows[0], v_g1), _dot(rows[1], v_g1), _dot(rows[2], v_g1))
-        v_u2 = (_dot(rows[0], v_g2), _dot(rows[1], v_g2), _dot(rows[2], v_g2))
-        _write_mean_gradient(
-            point, camera, u1, u2, free_x, free_y, v_u1, v_u2, v_x, v_y, sums[i, 9], v_means, i
-        )
-        v_opacities[i] = -sums[i, 0] / opacities[i]
+    scratch = np.empty(_PLANES * LANES, np.float32)
+    end = n * (part + 1) // parts
+    for start in range(n * part // parts, end, LANES):
+        _lay_out(scratch, start, end, means, rotations, scales, opacities)
+        for lane in range(LANES):
+            for k in range(10):
+                scratch[(_SUMS + k) * LANES + lane] = sums[min(start + lane, end - 1), k]
+        _project_backward(scratch, camera, width, height)
+        for lane in range(min(LANES, end - start)):
+            i = start + lane
+            if bounds[i, 1] == 0:
+                continue
+            for k in range(3):
+                v_means[i, k] = scratch[(_MEAN + k) * LANES + lane]
+                v_scales[i, k] = scratch[(_SCALES + k) * LANES + lane]
+            for k in range(4):
+                v_rotations[i, k] = scratch[(_ROTATION + k) * LANES + lane]
+            v_opacities[i] = scratch[_OPACITY * LANES + lane]

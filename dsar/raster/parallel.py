@@ -15,9 +15,14 @@ _MAX_PARTS = 16
 """More threads than this wait for each other longer than an image takes."""
 
 
+def part_count() -> int:
+    """Return how many parts the next kernel is run in."""
+    return min(numba.get_num_threads(), _MAX_PARTS)
+
+
 def run_parts(kernel: Callable[..., None], *arguments: object) -> None:
     """Run kernel(part, parts, *arguments) for every part, one per thread (`numba.get_num_threads`)."""
-    parts = min(numba.get_num_threads(), _MAX_PARTS)
+    parts = part_count()
     others = [_pool(os.getpid(), parts).submit(kernel, part, parts, *arguments) for part in range(1, parts)]
     kernel(0, parts, *arguments)
     for other in others:

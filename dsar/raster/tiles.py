@@ -1,0 +1,15 @@
+"""How the image is cut up: tiles, whose lists of splats are sorted, of blocks, which a register holds.
+
+A block is 4 pixels wide and as tall as LANES allows. Bit `column * STRIPS + strip` of a set of blocks stands
+for the block in that column and strip (row of blocks) of the tile.
+"""
+
+from dsar.raster.simd import LANES
+
+TILE = 16
+"""Pixels along a tile's side."""
+BLOCK_WIDTH = 4
+BLOCK_HEIGHT = LANES // BLOCK_WIDTH
+COLUMNS = TILE // BLOCK_WIDTH
+STRIPS = TILE // BLOCK_HEIGHT
+BLOCKS = COLUMNS * STRIPS
