@@ -12,7 +12,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 
@@ -122,6 +122,21 @@ class Motion:
 
 
 @dataclass(frozen=True)
+class Contributors:
+    """Which Gaussians made every pixel of an image: as many as blended there, pixel after pixel, row by row.
+
+    Any other image is a sum over them: that of `weights * values[ids]` for values of the Gaussians.
+    """
+
+    counts: Int[Tensor, "h w"]
+    """How many Gaussians each pixel has."""
+    ids: Int[Tensor, " m"]
+    """Their indices, front to back."""
+    weights: Float[Tensor, " m"]
+    """Their shares of the pixel: alpha times the transmittance of all in front; they sum to its alpha."""
+
+
+@dataclass(frozen=True)
 class RenderOutput:
     """What the rasteriser makes of one view."""
 
@@ -131,6 +146,13 @@ class RenderOutput:
     """Coverage in [0, 1]."""
     depth: Float[Tensor, "h w"]
     """Expected camera-space z in metres, sum(w z) / sum(w); 0 where nothing was hit."""
+    culled: Int[Tensor, ""]
+    """How many Gaussians were left out: not valid, too near, too faint, or outside the image."""
+    median_depth: Float[Tensor, "h w"] | None = None
+    """On request: z of the Gaussian with which transmittance falls to a half, else of the last one, metres; 0
+    where nothing was hit. No gradient."""
+    contributors: Contributors | None = None
+    """On request; no gradient."""
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """Gaussians to images: one function, several backends with the same meaning."""
 
-from typing import Literal
+from collections.abc import Collection
+from typing import Literal, get_args
 
 import torch
 from jaxtyping import Float
@@ -8,10 +9,12 @@ from torch import Tensor
 
 from dsar.errors import CaptureError, ConfigError
 from dsar.raster.conventions import EPS_2D
-from dsar.raster.reference import rasterize_reference
 from dsar.types import Camera, Gaussians, RenderOutput
 
-__all__ = ["rasterize", "reduced_dilation"]
+__all__ = ["Backend", "Output", "rasterize", "reduced_dilation"]
+
+Backend = Literal["auto", "cpu", "cuda", "reference"]
+Output = Literal["median_depth", "contributors"]
 
 
 def rasterize(
@@ -19,48 +22,49 @@ def rasterize(
     camera: Camera,
     *,
     background: Float[Tensor, "3"] | None = None,
-    directions: Float[Tensor, "n 3"] | None = None,
     dilation: float = EPS_2D,
-    backend: Literal["auto", "reference", "cpu"] = "auto",
+    antialiased: bool = False,
+    backend: Backend = "auto",
+    outputs: Collection[Output] = (),
 ) -> RenderOutput:
     """Blend Gaussians front to back into colour, alpha and depth (3D Gaussian Splatting, as gsplat 1.5.3).
 
     A Gaussian is left out, and gets zero gradients, if its centre is behind the camera or nearer than 0.01 m,
-    if its opacity is below 1/255, if a scale is not positive, or if anything about it is not finite.
+    if its opacity is below 1/255, if a scale is not positive, if anything about it is not finite, or if it
+    reaches no pixel; `RenderOutput.culled` counts them.
 
     Args:
         gaussians: in the world, physical values; quaternions are normalised here.
         camera: OpenCV pinhole without skew. Gets gradients from the reference backend only.
         background: sRGB that shows through the transmittance left over; by default black.
-        directions: unit directions in which the harmonics are evaluated (an avatar's are those of its
-            canonical pose); by default from the camera's centre to each mean in the world.
         dilation: pixels² added to both diagonal entries of the image-plane covariance; see `reduced_dilation`
             for images that are compared with block averages of larger ones.
-        backend: `cpu` (Numba, float32), `reference` (plain torch, any dtype and device, 20 times slower), or
-            `auto`: `cpu` for float32 tensors in main memory, else `reference`.
+        antialiased: lower opacities by what dilation adds in area, so that splats smaller than a pixel do not
+            thicken as the camera moves away (Yu et al. 2024, Mip-Splatting).
+        backend: `cpu` (Numba, float32), `cuda` (gsplat, float32), `reference` (plain torch, any dtype and
+            device, a hundred times slower), or `auto`: for float32 the fast one where the tensors are, else
+            `reference`.
+        outputs: what to compute besides colour, alpha and expected depth.
 
     Returns:
-        The image, differentiable by all Gaussian fields, `directions` and `background`.
+        The image, differentiable by all Gaussian fields and `background`.
 
     Raises:
         ConfigError: the tensors do not fit the backend, or the number of harmonics is none of 1, 4, 9, 16.
         CaptureError: the camera has skew, no positive focal length or no pixels.
     """
     _check_camera(camera)
-    _check_tensors(gaussians, background, directions)
-    fits_kernels = gaussians.means.dtype == torch.float32 and gaussians.means.device.type == "cpu"
-    wants_camera_gradient = camera.K.requires_grad or camera.T_camera_world.requires_grad
-    if backend == "reference" or (backend == "auto" and not fits_kernels):
-        return rasterize_reference(gaussians, camera, background, directions, dilation)
-    if not fits_kernels:
-        found = f"{gaussians.means.dtype} on {gaussians.means.device}"
-        raise ConfigError(f"rasterize: the cpu backend takes float32 tensors in main memory, not {found}")
-    if wants_camera_gradient:
-        raise ConfigError("rasterize: the cpu backend has no camera gradients; use backend='reference'")
-    # Here, not above: importing the kernels takes a while, and reference users need none.
-    from dsar.raster.cpu import rasterize_cpu
-
-    return rasterize_cpu(gaussians, camera, background, directions, dilation)
+    _check_tensors(gaussians, background)
+    _check_outputs(outputs)
+    chosen = _choose_backend(backend, gaussians.means, camera)
+    # Imported where they are wanted: kernels take a while to load, and reference users need none.
+    if chosen == "cpu":
+        from dsar.raster.cpu import rasterize_cpu as rasterize_with
+    elif chosen == "cuda":
+        from dsar.raster.cuda import rasterize_cuda as rasterize_with
+    else:
+        from dsar.raster.reference import rasterize_reference as rasterize_with
+    return rasterize_with(gaussians, camera, background, dilation, antialiased, outputs)
 
 
 def reduced_dilation(factor: int) -> float:
@@ -70,6 +74,26 @@ def reduced_dilation(factor: int) -> float:
     Gaussians fitted to small images come out too small for large ones (Yu et al. 2024, Mip-Splatting).
     """
     return (EPS_2D + (factor**2 - 1) / 12) / factor**2
+
+
+def _choose_backend(backend: Backend, means: Tensor, camera: Camera) -> Backend:
+    """Return the backend to take; refuse one that does not suit tensors or camera."""
+    place = means.device.type
+    if backend == "auto":
+        backend = place if means.dtype == torch.float32 and place in ("cpu", "cuda") else "reference"
+    if backend == "reference":
+        return backend
+    if means.dtype != torch.float32 or place != backend:
+        where = "on a GPU" if backend == "cuda" else "in main memory"
+        raise ConfigError(
+            f"rasterize: the {backend} backend takes float32 tensors {where}, "
+            f"not {means.dtype} on {means.device}"
+        )
+    if camera.K.requires_grad or camera.T_camera_world.requires_grad:
+        raise ConfigError(
+            f"rasterize: the {backend} backend has no camera gradients; use backend='reference'"
+        )
+    return backend
 
 
 def _check_camera(camera: Camera) -> None:
@@ -84,17 +108,21 @@ def _check_camera(camera: Camera) -> None:
         raise CaptureError(f"camera {camera.name!r}: its image has {camera.width} x {camera.height} pixels")
 
 
-def _check_tensors(gaussians: Gaussians, background: Tensor | None, directions: Tensor | None) -> None:
+def _check_outputs(outputs: Collection[str]) -> None:
+    """Refuse outputs that do not exist."""
+    unknown = sorted(set(outputs) - set(get_args(Output)))
+    if unknown:
+        raise ConfigError(
+            f"rasterize: outputs can be {', '.join(get_args(Output))}; found {', '.join(unknown)}"
+        )
+
+
+def _check_tensors(gaussians: Gaussians, background: Tensor | None) -> None:
     """Refuse tensors that do not belong together."""
     count = gaussians.harmonics.shape[1]
     if count not in (1, 4, 9, 16):
         raise ConfigError(
             f"rasterize: harmonics come in 1, 4, 9 or 16 coefficients (degree 0-3), not {count}"
-        )
-    if directions is not None and directions.shape != gaussians.means.shape:
-        raise ConfigError(
-            f"rasterize: directions are {tuple(directions.shape)}, expected {tuple(gaussians.means.shape)}: "
-            "one per Gaussian"
         )
     means = gaussians.means
     others = (
@@ -103,7 +131,6 @@ def _check_tensors(gaussians: Gaussians, background: Tensor | None, directions: 
         gaussians.opacities,
         gaussians.harmonics,
         background,
-        directions,
     )
     for tensor in others:
         if tensor is not None and (tensor.dtype != means.dtype or tensor.device != means.device):

@@ -4,8 +4,11 @@ Gradients are written by hand and checked against dsar.raster.reference. Results
 for any number of threads (`numba.set_num_threads`); with one thread, all runs in the caller's.
 """
 
+import dataclasses
 import logging
 import time
+from collections.abc import Collection
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -26,104 +29,104 @@ from dsar.raster.kernels_binning import (
 )
 from dsar.raster.kernels_compositing import (
     SUMS_SIZE,
+    collect_part,
     composite_backward_part,
     composite_part,
+    survey_part,
 )
 from dsar.raster.kernels_projection import RECORD_SIZE, project_backward_part, project_part
 from dsar.raster.kernels_shading import shade_backward_part, shade_part
 from dsar.raster.parallel import part_count, run_parts
 from dsar.raster.tiles import TILE
-from dsar.types import Camera, Gaussians, RenderOutput
+from dsar.types import Camera, Contributors, Gaussians, RenderOutput
 
 _log = logging.getLogger(__name__)
 _NO_IMAGE = np.empty((0, 0), np.float32)
 _NO_COLOR = np.empty((0, 0, 3), np.float32)
-_NO_DIRECTIONS = np.empty((0, 3), np.float32)
 _BLACK = np.zeros(3, np.float32)
 
 
 def rasterize_cpu(
     gaussians: Gaussians,
     camera: Camera,
-    background: Float[Tensor, "3"] | None = None,
-    directions: Float[Tensor, "n 3"] | None = None,
-    dilation: float = EPS_2D,
+    background: Float[Tensor, "3"] | None,
+    dilation: float,
+    antialiased: bool,
+    outputs: Collection[str],
 ) -> RenderOutput:
     """Rasterise with Numba: `dsar.raster.rasterize` without its checks, for float32 in main memory."""
     _load_kernels()
-    return _apply(gaussians, camera, background, directions, dilation)
+    return _apply(gaussians, background, _Settings(camera, dilation, antialiased, outputs))
 
 
-def _apply(
-    gaussians: Gaussians,
-    camera: Camera,
-    background: Tensor | None,
-    directions: Tensor | None,
-    dilation: float,
-) -> RenderOutput:
-    color, alpha, depth = _Rasterize.apply(
-        gaussians.means,
-        gaussians.rotations,
-        gaussians.scales,
-        gaussians.opacities,
-        gaussians.harmonics,
-        directions,
-        background,
-        camera,
-        dilation,
-    )  # type: ignore[misc]  # autograd's apply is untyped
-    return RenderOutput(color, alpha, depth)
+@dataclass(frozen=True)
+class _Settings:
+    """What has no gradient."""
+
+    camera: Camera
+    dilation: float = EPS_2D
+    antialiased: bool = False
+    outputs: Collection[str] = ()
+
+
+def _apply(gaussians: Gaussians, background: Tensor | None, settings: _Settings) -> RenderOutput:
+    fields = (getattr(gaussians, field.name) for field in dataclasses.fields(gaussians))
+    images = _Rasterize.apply(*fields, background, settings)
+    color, alpha, depth, culled, median, counts, ids, weights = images  # type: ignore[misc]  # untyped
+    contributors = Contributors(counts, ids, weights) if counts is not None else None
+    return RenderOutput(color, alpha, depth, culled, median, contributors)
 
 
 class _Rasterize(torch.autograd.Function):
-    """Gaussians to (color, alpha, depth). The camera gets no gradient."""
+    """Gaussians to (color, alpha, depth) and, without gradients, what was asked for besides."""
 
     @staticmethod
-    def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor, Tensor]:
-        *tensors, camera, dilation = inputs
+    def forward(ctx: Any, *inputs: Any) -> tuple[Tensor | None, ...]:
+        *tensors, settings = inputs
         ctx.set_materialize_grads(False)
-        means, rotations, scales, opacities, harmonics = (_as_array(tensor) for tensor in tensors[:5])
-        directions, background = _as_array(tensors[5], _NO_DIRECTIONS), _as_array(tensors[6], _BLACK)
-        n, width, height = len(means), camera.width, camera.height
-        view, center = _pack_camera(camera, dilation)
+        arrays, background = [_as_array(tensor) for tensor in tensors[:5]], _as_array(tensors[5])
+        n, width, height = len(arrays[0]), settings.camera.width, settings.camera.height
+        view, center = _pack_camera(settings)
         records = _new_records(n)
         bounds = records.view(np.int32)[:, -4:]
-        run_parts(_prepare_part, means, rotations, scales, opacities, harmonics, directions,
-                  view, center, width, height, records, bounds)  # fmt: skip
+        run_parts(_prepare_part, *arrays, view, center, width, height, records, bounds)
         tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
-        tile_starts, pairs, splat_starts, places = _bin(records, bounds, tiles_x, tiles_y)
+        order = sort_by_depth(records, bounds)
+        bins = _bin(order, records, bounds, tiles_x, tiles_y)
         outputs = torch.empty(height, width, 3), torch.empty(height, width), torch.empty(height, width)
         images = [output.numpy() for output in outputs]
-        run_parts(composite_part, records, tile_starts, pairs, tiles_x, background, *images)
+        run_parts(composite_part, records, bins[0], bins[1], tiles_x, background, *images)
+        culled = torch.tensor(n - len(order))
+        extras = _survey(records, bins[0], bins[1], tiles_x, settings)
+        ctx.mark_non_differentiable(culled, *(extra for extra in extras if extra is not None))
         ctx.save_for_backward(*tensors, *outputs)
         ctx.splats = records, bounds, view, center
-        ctx.bins = tile_starts, pairs, splat_starts, places, tiles_x
-        return outputs
+        ctx.bins = *bins, tiles_x
+        return *outputs, culled, *extras
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *v_outputs: Tensor | None) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         *tensors, color, alpha, depth = ctx.saved_tensors
-        arrays = [*map(_as_array, tensors[:5]), _as_array(tensors[5], _NO_DIRECTIONS)]
+        arrays = [_as_array(tensor) for tensor in tensors[:5]]
         records, bounds, view, center = ctx.splats
         tile_starts, pairs, splat_starts, places, tiles_x = ctx.bins
         height, width = alpha.shape
         images = color.numpy(), alpha.numpy(), depth.numpy()
-        v_color, v_alpha, v_depth = map(_as_array, v_outputs, (_NO_COLOR, _NO_IMAGE, _NO_IMAGE))
+        v_images = map(_as_array, v_outputs[:3], (_NO_COLOR, _NO_IMAGE, _NO_IMAGE))
         pair_sums = np.empty((len(pairs), SUMS_SIZE), np.float32)
-        run_parts(composite_backward_part, records, tile_starts, pairs, tiles_x, *images,
-                  v_color, v_alpha, v_depth, pair_sums)  # fmt: skip
+        run_parts(
+            composite_backward_part, records, tile_starts, pairs, tiles_x, *images, *v_images, pair_sums
+        )
         # Zeros from NumPy: torch would fill them with OpenMP threads, which then spin on the cores we need.
         gradients = [np.zeros(array.shape, np.float32) for array in arrays]
         sums = np.empty((len(bounds), SUMS_SIZE), np.float32)
         run_parts(_finish_part, *arrays, view, center, width, height, bounds, splat_starts, places, pair_sums,
                   sums, *gradients)  # fmt: skip
-        v_inputs = [torch.from_numpy(gradient) for gradient in gradients]
-        v_directions = None if tensors[5] is None else v_inputs[5]
         v_background = None
-        if ctx.needs_input_grad[6] and v_outputs[0] is not None:
+        if ctx.needs_input_grad[5] and v_outputs[0] is not None:
             v_background = torch.einsum("hw,hwc->c", 1 - alpha, v_outputs[0])
-        return *v_inputs[:5], v_directions, v_background, None, None
+        return *map(torch.from_numpy, gradients), v_background, None
 
 
 def _new_records(count: int) -> np.ndarray:
@@ -137,7 +140,9 @@ def _new_records(count: int) -> np.ndarray:
     return lines[first : first + count * RECORD_SIZE].reshape(count, RECORD_SIZE)
 
 
-def _bin(records: np.ndarray, bounds: np.ndarray, tiles_x: int, tiles_y: int) -> tuple[np.ndarray, ...]:
+def _bin(
+    order: np.ndarray, records: np.ndarray, bounds: np.ndarray, tiles_x: int, tiles_y: int
+) -> tuple[np.ndarray, ...]:
     """Return each tile's list of splats, front to back.
 
     Returns:
@@ -146,7 +151,6 @@ def _bin(records: np.ndarray, bounds: np.ndarray, tiles_x: int, tiles_y: int) ->
         splat_starts: [n + 1] where each splat's places start.
         places: [p] of each splat's pairs.
     """
-    order = sort_by_depth(records, bounds)
     cursors = np.empty((part_count(), tiles_x * tiles_y), np.int32)
     tiles = np.zeros(len(bounds), np.int32)
     run_parts(count_pairs_part, order, records, bounds, tiles_x, cursors, tiles)
@@ -157,26 +161,45 @@ def _bin(records: np.ndarray, bounds: np.ndarray, tiles_x: int, tiles_y: int) ->
     return tile_starts, pairs, splat_starts, places
 
 
+def _survey(
+    records: np.ndarray, tile_starts: np.ndarray, pairs: np.ndarray, tiles_x: int, settings: _Settings
+) -> tuple[Tensor | None, ...]:
+    """Return median depths, and the counts, ids and weights of contributors; None for what is not wanted."""
+    if not settings.outputs:
+        return None, None, None, None
+    width, height = settings.camera.width, settings.camera.height
+    medians, counts = torch.empty(height, width), torch.empty(height, width, dtype=torch.int32)
+    run_parts(survey_part, records, tile_starts, pairs, tiles_x, medians.numpy(), counts.numpy())
+    wanted = medians if "median_depth" in settings.outputs else None
+    if "contributors" not in settings.outputs:
+        return wanted, None, None, None
+    ends = counts.flatten().cumsum(0)
+    ids, weights = torch.empty(int(ends[-1]), dtype=torch.int64), torch.empty(int(ends[-1]))
+    starts = (ends - counts.flatten()).numpy()
+    run_parts(collect_part, records, tile_starts, pairs, tiles_x, width, height, starts, ids.numpy(),
+              weights.numpy())  # fmt: skip
+    return wanted, counts, ids, weights
+
+
 def _prepare_part(
-    part, parts, means, rotations, scales, opacities, harmonics, directions,
+    part, parts, means, rotations, scales, opacities, harmonics,
     view, center, width, height, records, bounds,
 ):  # fmt: skip
     """Turn one part of the Gaussians into splats."""
     project_part(part, parts, means, rotations, scales, opacities, view, width, height, records, bounds)
-    shade_part(part, parts, means, harmonics, directions, center, records, bounds)
+    shade_part(part, parts, means, harmonics, center, records, bounds)
 
 
 def _finish_part(
-    part, parts, means, rotations, scales, opacities, harmonics, directions,
+    part, parts, means, rotations, scales, opacities, harmonics,
     view, center, width, height, bounds, splat_starts, places, pair_sums, sums,
-    v_means, v_rotations, v_scales, v_opacities, v_harmonics, v_directions,
+    v_means, v_rotations, v_scales, v_opacities, v_harmonics,
 ):  # fmt: skip
     """Bring the gradients of one part's splats back to their Gaussians."""
     gather_sums_part(part, parts, splat_starts, places, pair_sums, sums)
     project_backward_part(part, parts, means, rotations, scales, opacities, view, width, height,
                           bounds, sums, v_means, v_rotations, v_scales, v_opacities)  # fmt: skip
-    shade_backward_part(part, parts, means, harmonics, directions, center,
-                        bounds, sums, v_harmonics, v_directions, v_means)  # fmt: skip
+    shade_backward_part(part, parts, means, harmonics, center, bounds, sums, v_harmonics, v_means)
 
 
 def _as_array(tensor: Tensor | None, missing: np.ndarray = _BLACK) -> np.ndarray:
@@ -184,13 +207,14 @@ def _as_array(tensor: Tensor | None, missing: np.ndarray = _BLACK) -> np.ndarray
     return missing if tensor is None else tensor.detach().contiguous().numpy()
 
 
-def _pack_camera(camera: Camera, dilation: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the kernels' camera (17 numbers, see kernels_projection) and its centre in the world."""
-    transform, K = camera.T_camera_world.detach().numpy(), camera.K.detach().numpy()
+def _pack_camera(settings: _Settings) -> tuple[np.ndarray, np.ndarray]:
+    """Return the kernels' camera (18 numbers, see kernels_projection) and its centre in the world."""
+    transform, K = settings.camera.T_camera_world.detach().numpy(), settings.camera.K.detach().numpy()
     rotation, translation = transform[:3, :3], transform[:3, 3]
-    view = np.empty(17, np.float32)
+    view = np.empty(18, np.float32)
     view[:9], view[9:12] = rotation.ravel(), translation
-    view[12:] = K[0, 0], K[1, 1], K[0, 2], K[1, 2], dilation
+    view[12:16] = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    view[16:] = settings.dilation, settings.antialiased
     return view, (-rotation.T @ translation).astype(np.float32)
 
 
@@ -206,5 +230,5 @@ def _load_kernels() -> None:
             torch.tensor([[0.0, 0.0, 1.0]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]]), torch.ones(1, 3),
             torch.full((1,), 0.5), torch.zeros(1, 1, 3),
         ).map(Tensor.requires_grad_)  # fmt: skip
-        _apply(one, camera, None, None, EPS_2D).color.sum().backward()
+        _apply(one, None, _Settings(camera)).color.sum().backward()
     _log.info("Rasteriser ready after %.1f s", time.perf_counter() - start)

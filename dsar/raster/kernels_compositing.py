@@ -51,6 +51,9 @@ _FORWARD = np.uint64(7 * LANES)
 # Backward: the gradient that arrives at the pixel, and `rest`.
 _V_RED, _V_GREEN, _V_BLUE, _V_DEPTH, _REST = (np.uint64(plane * LANES) for plane in (3, 4, 5, 6, 7))
 _BACKWARD = np.uint64(8 * LANES)
+# Survey: depth at half transmittance, and how many splats were blended. Collecting needs no plane of its own.
+_MEDIAN, _COUNT = (np.uint64(plane * LANES) for plane in (3, 4))
+_SURVEY, _COLLECT = np.uint64(5 * LANES), np.uint64(3 * LANES)
 
 _LOG_ALPHA_MIN = np.float32(math.log2(ALPHA_MIN))
 _ALPHA_MAX, _T_MIN = np.float32(ALPHA_MAX), np.float32(TRANSMITTANCE_MIN)
@@ -68,6 +71,13 @@ def _new_state(stride):
             state[pixel + _X] = np.float32(x + lane % BLOCK_WIDTH) + _HALF
             state[pixel + _Y] = np.float32(y + lane // BLOCK_WIDTH) + _HALF
     return state
+
+
+@inlined
+def _pixel(x, y, stride):
+    """Return where a pixel of the tile lies in its state."""
+    block = x // BLOCK_WIDTH * STRIPS + y // BLOCK_HEIGHT
+    return np.uint64(block) * stride + np.uint64(y % BLOCK_HEIGHT * BLOCK_WIDTH + x % BLOCK_WIDTH)
 
 
 @inlined
@@ -100,8 +110,22 @@ def _fetch_ahead(records, pairs, place):
 
 
 @inlined
+def _place(records, i, left, top):
+    """Return what `_blend` needs of a splat, with the tile's corner as origin."""
+    x, y = records[i, 0] - np.float32(left), records[i, 1] - np.float32(top)
+    return (
+        spread(records[i, 2] * x - records[i, 3] * y),
+        spread(records[i, 2]),
+        spread(records[i, 3]),
+        spread(records[i, 4] * y),
+        spread(records[i, 4]),
+        spread(records[i, 5]),
+    )
+
+
+@inlined
 def _blend(state, start, e1_origin, stretch, shear, e2_origin, height, log_opacity):
-    """Pass one splat over one block; return e1, e2, alpha, its weight, and the transmittance behind it."""
+    """Pass one splat over one block; return e1, e2, alpha, its weight, and the transmittance before it."""
     e1 = e1_origin - stretch * load(state, start + _X) + shear * load(state, start + _Y)
     e2 = e2_origin - height * load(state, start + _Y)
     log_alpha = log_opacity - e1 * e1 - e2 * e2
@@ -111,7 +135,7 @@ def _blend(state, start, e1_origin, stretch, shear, e2_origin, height, log_opaci
     after = before - weight
     running = after > _T_MIN
     store(state, start + _T, choose(running, after, negated_size(before)))
-    return e1, e2, alpha, choose(running, weight, spread(_ZERO)), after
+    return e1, e2, alpha, choose(running, weight, spread(_ZERO)), before
 
 
 @inlined
@@ -135,9 +159,7 @@ def _close_tile(state, left, top, background, color, alpha, depth):
     height, width = alpha.shape
     for y in range(min(TILE, height - top)):
         for x in range(min(TILE, width - left)):
-            block = x // BLOCK_WIDTH * STRIPS + y // BLOCK_HEIGHT
-            lane = y % BLOCK_HEIGHT * BLOCK_WIDTH + x % BLOCK_WIDTH
-            pixel = np.uint64(block) * _FORWARD + np.uint64(lane)
+            pixel = _pixel(x, y, _FORWARD)
             through = abs(state[pixel + _T])
             color[top + y, left + x, 0] = state[pixel + _RED] + through * background[0]
             color[top + y, left + x, 1] = state[pixel + _GREEN] + through * background[1]
@@ -179,15 +201,12 @@ def composite_part(part, parts, records, tile_starts, pairs, tiles_x, background
 @inlined
 def _blend_splat(state, blocks, records, i, left, top):
     """Blend one splat over a set of blocks."""
-    x, y = records[i, 0] - np.float32(left), records[i, 1] - np.float32(top)
-    stretch, shear, height = spread(records[i, 2]), spread(records[i, 3]), spread(records[i, 4])
-    e1_origin, e2_origin = spread(records[i, 2] * x - records[i, 3] * y), spread(records[i, 4] * y)
-    log_opacity = spread(records[i, 5])
+    splat = _place(records, i, left, top)
     red, green, blue, z = records[i, 6], records[i, 7], records[i, 8], records[i, 9]
     while blocks != np.uint32(0):
         start = lowest_bit(blocks) * _FORWARD
         blocks &= blocks - np.uint32(1)
-        _, _, _, weight, _ = _blend(state, start, e1_origin, stretch, shear, e2_origin, height, log_opacity)
+        _, _, _, weight, _ = _blend(state, start, *splat)
         _add(state, start + _RED, weight * red)
         _add(state, start + _GREEN, weight * green)
         _add(state, start + _BLUE, weight * blue)
@@ -197,10 +216,7 @@ def _blend_splat(state, blocks, records, i, left, top):
 @inlined
 def _blend_splat_backward(state, blocks, records, i, left, top, out):
     """Blend one splat again, and write its gradient sums over a set of blocks."""
-    x, y = records[i, 0] - np.float32(left), records[i, 1] - np.float32(top)
-    stretch, shear, height = spread(records[i, 2]), spread(records[i, 3]), spread(records[i, 4])
-    e1_origin, e2_origin = spread(records[i, 2] * x - records[i, 3] * y), spread(records[i, 4] * y)
-    log_opacity = spread(records[i, 5])
+    splat = _place(records, i, left, top)
     red, green, blue, z = records[i, 6], records[i, 7], records[i, 8], records[i, 9]
     zero = spread(_ZERO)
     s, s1, s2, s11, s12, s22 = zero, zero, zero, zero, zero, zero
@@ -208,9 +224,7 @@ def _blend_splat_backward(state, blocks, records, i, left, top, out):
     while blocks != np.uint32(0):
         start = lowest_bit(blocks) * _BACKWARD
         blocks &= blocks - np.uint32(1)
-        e1, e2, alpha, weight, after = _blend(
-            state, start, e1_origin, stretch, shear, e2_origin, height, log_opacity
-        )
+        e1, e2, alpha, weight, before = _blend(state, start, *splat)
         q = red * load(state, start + _V_RED) + green * load(state, start + _V_GREEN)
         q += blue * load(state, start + _V_BLUE) + z * load(state, start + _V_DEPTH)
         rest = load(state, start + _REST) - weight * q
@@ -220,7 +234,7 @@ def _blend_splat_backward(state, blocks, records, i, left, top, out):
         v_blue += weight * load(state, start + _V_BLUE)
         v_z += weight * load(state, start + _V_DEPTH)
         # v = -alpha dL/dalpha; where alpha is clamped it does not move with the splat's shape.
-        v = choose(alpha < _ALPHA_MAX, weight * (rest / after - q), zero)
+        v = choose(alpha < _ALPHA_MAX, weight * (rest / (before - weight) - q), zero)
         v1, v2 = v * e1, v * e2
         s += v
         s1 += v1
@@ -240,9 +254,7 @@ def _load_gradients(state, left, top, color, alpha, depth, v_color, v_alpha, v_d
     height, width = alpha.shape
     for y in range(top, min(top + TILE, height)):
         for x in range(left, min(left + TILE, width)):
-            block = (x - left) // BLOCK_WIDTH * STRIPS + (y - top) // BLOCK_HEIGHT
-            lane = (y - top) % BLOCK_HEIGHT * BLOCK_WIDTH + (x - left) % BLOCK_WIDTH
-            pixel = np.uint64(block) * _BACKWARD + np.uint64(lane)
+            pixel = _pixel(x - left, y - top, _BACKWARD)
             red, green, blue, v_z, rest, v_through = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
             if len(v_alpha) > 0:
                 v_through -= v_alpha[y, x]
@@ -285,3 +297,60 @@ def composite_backward_part(
                 pair_sums[place] = _ZERO
             else:
                 _blend_splat_backward(state, blocks, records, i, left, top, pair_sums[place])
+
+
+@kernel
+def survey_part(part, parts, records, tile_starts, pairs, tiles_x, medians, counts):
+    """Blend every parts-th tile once more, for its median depths and how many splats each pixel has."""
+    height, width = medians.shape
+    state = _new_state(_SURVEY)
+    for tile in range(part, len(tile_starts) - 1, parts):
+        left, top = tile % tiles_x * TILE, tile // tiles_x * TILE
+        _open_tile(state, _SURVEY, width - left, height - top)
+        for block in range(np.uint64(BLOCKS)):
+            store(state, block * _SURVEY + _MEDIAN, spread(_ZERO))
+            store(state, block * _SURVEY + _COUNT, spread(_ZERO))
+        for place in range(tile_starts[tile], tile_starts[tile + 1]):
+            blocks, i = np.uint32(pairs[place, 1]), np.uint64(pairs[place, 0])
+            splat = _place(records, i, left, top)
+            while blocks != np.uint32(0):
+                start = lowest_bit(blocks) * _SURVEY
+                blocks &= blocks - np.uint32(1)
+                _, _, _, weight, before = _blend(state, start, *splat)
+                median, blended = load(state, start + _MEDIAN), weight > _ZERO
+                is_median = blended & (before > _HALF)
+                store(state, start + _MEDIAN, choose(is_median, spread(records[i, 9]), median))
+                _add(state, start + _COUNT, choose(blended, spread(_ONE), spread(_ZERO)))
+        for y in range(min(TILE, height - top)):
+            for x in range(min(TILE, width - left)):
+                pixel = _pixel(x, y, _SURVEY)
+                medians[top + y, left + x] = state[pixel + _MEDIAN]
+                counts[top + y, left + x] = np.int32(state[pixel + _COUNT])
+
+
+@kernel
+def collect_part(part, parts, records, tile_starts, pairs, tiles_x, width, height, starts, ids, weights):
+    """Blend every parts-th tile once more, and write each pixel's splats and weights from its start on."""
+    state, lanes = _new_state(_COLLECT), np.empty(LANES, np.float32)
+    cursors = np.empty(BLOCKS * LANES, np.int64)
+    for tile in range(part, len(tile_starts) - 1, parts):
+        left, top = tile % tiles_x * TILE, tile // tiles_x * TILE
+        _open_tile(state, _COLLECT, width - left, height - top)
+        for y in range(min(TILE, height - top)):
+            for x in range(min(TILE, width - left)):
+                cursors[_pixel(x, y, np.uint64(LANES))] = starts[(top + y) * width + left + x]
+        for place in range(tile_starts[tile], tile_starts[tile + 1]):
+            blocks, i = np.uint32(pairs[place, 1]), np.uint64(pairs[place, 0])
+            splat = _place(records, i, left, top)
+            while blocks != np.uint32(0):
+                block = lowest_bit(blocks)
+                blocks &= blocks - np.uint32(1)
+                _, _, _, weight, _ = _blend(state, block * _COLLECT, *splat)
+                store(lanes, np.uint64(0), weight)
+                hits = bits_of(weight > _ZERO)
+                while hits != np.uint32(0):
+                    lane = lowest_bit(hits)
+                    hits &= hits - np.uint32(1)
+                    cursor = block * np.uint64(LANES) + lane
+                    ids[cursors[cursor]], weights[cursors[cursor]] = i, lanes[lane]
+                    cursors[cursor] += 1

@@ -12,7 +12,8 @@ The colour is left to kernels_shading.
 
 Gaussians go through LANES at a time: their rows are first laid out as planes of a scratch array. Every kernel
 takes `part` of `parts` and touches only those rows, so results do not depend on their number. The camera is
-17 numbers: rotation (row-major 9), translation (3), fx, fy, cx, cy, and the splats' dilation.
+18 numbers: rotation (row-major 9), translation (3), fx, fy, cx, cy, the splats' dilation, and 1 if dilation
+takes as much opacity as it adds area (Yu et al. 2024, Mip-Splatting), else 0.
 """
 
 import math
@@ -162,17 +163,17 @@ def _scaled(g, scales):
 
 @inlined
 def _covariance(m1, m2, dilation):
-    """Return (A, B, C, A - B²/C) of the image-plane covariance [[A, B], [B, C]], pixels².
+    """Return (A, B, C, A - B²/C) of the dilated image-plane covariance [[A, B], [B, C]], pixels².
 
-    The determinant comes from the cross product, which keeps its digits for thin splats.
+    And its determinant before dilation, from the cross product, which keeps its digits for thin splats.
     """
     a0, b, c0 = _dot(m1, m1), _dot(m1, m2), _dot(m2, m2)
     nx = m1[1] * m2[2] - m1[2] * m2[1]
     ny = m1[2] * m2[0] - m1[0] * m2[2]
     nz = m1[0] * m2[1] - m1[1] * m2[0]
     c = c0 + dilation
-    determinant = nx * nx + ny * ny + nz * nz + dilation * (a0 + c0) + dilation * dilation
-    return a0 + dilation, b, c, determinant / c
+    thin = nx * nx + ny * ny + nz * nz
+    return a0 + dilation, b, c, (thin + dilation * (a0 + c0) + dilation * dilation) / c, thin
 
 
 @inlined
@@ -194,7 +195,9 @@ def _project(scratch, camera, width, height):
     rows = _rotation_rows(w, x, y, z)
     u1, u2, _, _ = _image_axes(point, camera, width, height)
     m1, m2 = _scaled(_times_matrix(u1, rows), scales), _scaled(_times_matrix(u2, rows), scales)
-    a, b, c, slim = _covariance(m1, m2, camera[16])
+    a, b, c, slim, thin = _covariance(m1, m2, camera[16])
+    if camera[17] > _ZERO:
+        opacity = opacity * square_root(thin / (slim * c))
     mean_x = camera[12] * point[0] / point[2] + camera[14]
     mean_y = camera[13] * point[1] / point[2] + camera[15]
     log_opacity = log_two(opacity)
@@ -307,8 +310,14 @@ def _project_backward(scratch, camera, width, height):
     u1, u2, free_x, free_y = _image_axes(point, camera, width, height)
     g1, g2 = _times_matrix(u1, rows), _times_matrix(u2, rows)
     m1, m2 = _scaled(g1, scales), _scaled(g2, scales)
-    a, b, c, slim = _covariance(m1, m2, camera[16])
+    a, b, c, slim, thin = _covariance(m1, m2, camera[16])
     v_x, v_y, v_a, v_b, v_c = _splat_gradient(scratch, a, b, c, slim)
+    if camera[17] > _ZERO:
+        # opacity² is proportional to thin / (slim c), and thin is that determinant without dilation.
+        v_log, whole = -(_HALF * _plane(scratch, _SUMS)), slim * c
+        v_a += v_log * ((c - camera[16]) / thin - c / whole)
+        v_c += v_log * ((a - camera[16]) / thin - a / whole)
+        v_b += v_log * _TWO * b * (_ONE / whole - _ONE / thin)
     twice_a, twice_c = _TWO * v_a, _TWO * v_c
     v_m1 = (
         twice_a * m1[0] + v_b * m2[0],

@@ -64,17 +64,15 @@ def _direction_gradient(v, x, y, z):
 
 
 @inlined
-def _direction(means, directions, center, i):
-    """Return the direction a Gaussian is seen along and the inverse of its distance (unused if given)."""
-    if len(directions) > 0:
-        return directions[i, 0], directions[i, 1], directions[i, 2], _ONE
+def _direction(means, center, i):
+    """Return the direction a Gaussian is seen along and the inverse of its distance."""
     x, y, z = means[i, 0] - center[0], means[i, 1] - center[1], means[i, 2] - center[2]
     inverse = _ONE / math.sqrt(x * x + y * y + z * z)
     return x * inverse, y * inverse, z * inverse, inverse
 
 
 @kernel
-def shade_part(part, parts, means, harmonics, directions, center, records, bounds):
+def shade_part(part, parts, means, harmonics, center, records, bounds):
     """Write the colours of one part of the records; a colour that is not finite empties the bounds."""
     n, count = len(means), harmonics.shape[1]
     basis = np.empty(count, np.float32)
@@ -83,7 +81,7 @@ def shade_part(part, parts, means, harmonics, directions, center, records, bound
         if bounds[i, 1] == 0:
             continue
         if count > 1:
-            x, y, z, _ = _direction(means, directions, center, i)
+            x, y, z, _ = _direction(means, center, i)
             _fill_basis(basis, x, y, z)
         red, green, blue = _HALF, _HALF, _HALF
         for k in range(count):
@@ -98,10 +96,8 @@ def shade_part(part, parts, means, harmonics, directions, center, records, bound
 
 
 @kernel
-def shade_backward_part(
-    part, parts, means, harmonics, directions, center, bounds, sums, v_harmonics, v_directions, v_means
-):
-    """Write the gradient of the harmonics and of given directions; if none were, add it to the means'."""
+def shade_backward_part(part, parts, means, harmonics, center, bounds, sums, v_harmonics, v_means):
+    """Write the gradient of the harmonics, and add that of the directions to the means'."""
     n, count = len(means), harmonics.shape[1]
     basis, v_basis = np.empty(count, np.float32), np.empty(count, np.float32)
     basis[0] = _C0
@@ -110,7 +106,7 @@ def shade_backward_part(
             continue
         x, y, z, inverse = _ZERO, _ZERO, _ZERO, _ZERO
         if count > 1:
-            x, y, z, inverse = _direction(means, directions, center, i)
+            x, y, z, inverse = _direction(means, center, i)
             _fill_basis(basis, x, y, z)
         v_basis[:] = _ZERO
         for channel in range(3):
@@ -124,10 +120,7 @@ def shade_backward_part(
         if count == 1:
             continue
         v_x, v_y, v_z = _direction_gradient(v_basis, x, y, z)
-        if len(directions) > 0:
-            v_directions[i, 0], v_directions[i, 1], v_directions[i, 2] = v_x, v_y, v_z
-        else:
-            radial = x * v_x + y * v_y + z * v_z
-            v_means[i, 0] += (v_x - x * radial) * inverse
-            v_means[i, 1] += (v_y - y * radial) * inverse
-            v_means[i, 2] += (v_z - z * radial) * inverse
+        radial = x * v_x + y * v_y + z * v_z
+        v_means[i, 0] += (v_x - x * radial) * inverse
+        v_means[i, 1] += (v_y - y * radial) * inverse
+        v_means[i, 2] += (v_z - z * radial) * inverse

@@ -3,10 +3,11 @@
 It is what the fast kernels are tested against, so it follows the formulas and not the machine.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from dsar.geometry.harmonics import color_from_harmonics
@@ -14,12 +15,11 @@ from dsar.geometry.rotations import matrix_from_quaternion
 from dsar.raster.conventions import (
     ALPHA_MAX,
     ALPHA_MIN,
-    EPS_2D,
     FRUSTUM_MARGIN,
     NEAR,
     TRANSMITTANCE_MIN,
 )
-from dsar.types import Camera, Gaussians, RenderOutput
+from dsar.types import Camera, Contributors, Gaussians, RenderOutput
 
 _TILE = 16
 
@@ -28,6 +28,7 @@ _TILE = 16
 class _Splats:
     """Gaussians on the image, front to back."""
 
+    ids: Int[Tensor, " n"]
     means: Float[Tensor, "n 2"]
     """Pixels."""
     covariances: Float[Tensor, "n 2 2"]
@@ -39,74 +40,100 @@ class _Splats:
     """Half-width and half-height in pixels outside which alpha < ALPHA_MIN."""
 
 
+@dataclass(frozen=True)
+class _Tile:
+    """What blending leaves of one tile."""
+
+    image: Float[Tensor, "h w 5"]
+    """Red, green, blue, alpha, and sum(weight z)."""
+    median_depth: Float[Tensor, "h w"]
+    pixels: Int[Tensor, " m"]
+    """Pixel of each (splat, pixel) pair that was blended, flat in the whole image."""
+    ids: Int[Tensor, " m"]
+    weights: Float[Tensor, " m"]
+
+
 def rasterize_reference(
     gaussians: Gaussians,
     camera: Camera,
-    background: Float[Tensor, "3"] | None = None,
-    directions: Float[Tensor, "n 3"] | None = None,
-    dilation: float = EPS_2D,
+    background: Float[Tensor, "3"] | None,
+    dilation: float,
+    antialiased: bool,
+    outputs: Collection[str],
 ) -> RenderOutput:
     """Rasterise in plain torch: `dsar.raster.rasterize` without its checks, for any dtype and device."""
-    drawable = _find_drawable(gaussians, camera, directions)
-    # Selected before anything is computed: what is left out cannot send NaN back through a zero gradient.
-    gaussians = gaussians.map(lambda values: values[drawable])
-    splats = _splat(gaussians, camera, directions if directions is None else directions[drawable], dilation)
+    splats = _splat(gaussians, camera, dilation, antialiased)
     rows = [
-        torch.cat([_composite_tile(splats, x, y, camera) for x in range(0, camera.width, _TILE)], 1)
+        [_blend_tile(splats, x, y, camera) for x in range(0, camera.width, _TILE)]
         for y in range(0, camera.height, _TILE)
     ]
-    color, alpha, depth = torch.cat(rows, 0).split([3, 1, 1], -1)
+    images = torch.cat([torch.cat([tile.image for tile in row], 1) for row in rows], 0)
+    color, alpha, depth = images.split([3, 1, 1], -1)
     hit = alpha > 0
     depth = torch.where(hit, depth / torch.where(hit, alpha, 1), 0)
     if background is not None:
         color = color + (1 - alpha) * background
-    return RenderOutput(color, alpha[..., 0], depth[..., 0])
+    median = contributors = None
+    if "median_depth" in outputs:
+        median = torch.cat([torch.cat([tile.median_depth for tile in row], 1) for row in rows], 0)
+    if "contributors" in outputs:
+        contributors = _join([tile for row in rows for tile in row], camera)
+    culled = torch.tensor(len(gaussians) - len(splats.ids))
+    return RenderOutput(color, alpha[..., 0], depth[..., 0], culled, median, contributors)
+
+
+def _splat(gaussians: Gaussians, camera: Camera, dilation: float, antialiased: bool) -> _Splats:
+    """Return those Gaussians that reach a pixel, front to back, ties in their own order."""
+    drawable = _find_drawable(gaussians, camera, dilation, antialiased)
+    # Selected before anything is computed: what is left out cannot send NaN back through a zero gradient.
+    gaussians = gaussians.map(lambda values: values[drawable])
+    means, covariances, depths, opacities = _project(gaussians, camera, dilation, antialiased)
+    features = torch.cat([_shade(gaussians, camera), depths[:, None]], -1)
+    radii = _radii(covariances, opacities)
+    size = torch.tensor([camera.width, camera.height]).to(means)
+    first = torch.ceil(means - radii - 0.5).clamp_min(0)
+    end = torch.floor(means + radii + 0.5).minimum(size)
+    order = depths.detach().argsort(stable=True)
+    order = order[(first < end).all(-1)[order]]
+    ids = drawable.nonzero()[:, 0]
+    # A pixel more than needed: the blending itself cuts at ALPHA_MIN.
+    return _Splats(*(v[order] for v in (ids, means, covariances, opacities, features, radii + 1)))
 
 
 @torch.no_grad()
 def _find_drawable(
-    gaussians: Gaussians, camera: Camera, directions: Float[Tensor, "n 3"] | None
+    gaussians: Gaussians, camera: Camera, dilation: float, antialiased: bool
 ) -> Bool[Tensor, " n"]:
     """Return which Gaussians are in front, visible, of positive scale, and finite in all they project to."""
-    means, covariances, depths = _project(gaussians, camera, EPS_2D)
-    drawable = (depths > NEAR) & (gaussians.opacities >= ALPHA_MIN) & (gaussians.scales > 0).all(-1)
+    means, covariances, depths, opacities = _project(gaussians, camera, dilation, antialiased)
+    drawable = (depths > NEAR) & (opacities >= ALPHA_MIN) & (gaussians.scales > 0).all(-1)
     drawable &= gaussians.rotations.norm(dim=-1) > 0
-    colors = _shade(gaussians, camera, directions)
-    for values in (means, covariances.flatten(1), gaussians.opacities[:, None], colors):
+    for values in (means, covariances.flatten(1), opacities[:, None], _shade(gaussians, camera)):
         drawable &= values.isfinite().all(-1)
     return drawable
 
 
-def _splat(
-    gaussians: Gaussians, camera: Camera, directions: Float[Tensor, "n 3"] | None, dilation: float
-) -> _Splats:
-    """Return drawable Gaussians on the image, front to back, ties in their own order."""
-    means, covariances, depths = _project(gaussians, camera, dilation)
-    features = torch.cat([_shade(gaussians, camera, directions), depths[:, None]], -1)
-    reach = 2 * (gaussians.opacities.detach() / ALPHA_MIN).log()
-    variances = covariances.detach().diagonal(dim1=-2, dim2=-1)
-    # A pixel more than needed: the blending itself cuts at ALPHA_MIN.
-    radii = (reach[:, None] * variances).sqrt() + 1
-    order = depths.detach().argsort(stable=True)
-    return _Splats(*(v[order] for v in (means, covariances, gaussians.opacities, features, radii)))
+@torch.no_grad()
+def _radii(covariances: Float[Tensor, "n 2 2"], opacities: Float[Tensor, " n"]) -> Float[Tensor, "n 2"]:
+    """Return the half-width and half-height, pixels, outside which alpha < ALPHA_MIN."""
+    reach = 2 * (opacities / ALPHA_MIN).log()
+    return (reach[:, None] * covariances.diagonal(dim1=-2, dim2=-1)).sqrt()
 
 
-def _shade(
-    gaussians: Gaussians, camera: Camera, directions: Float[Tensor, "n 3"] | None
-) -> Float[Tensor, "n 3"]:
-    """Return the colour of each Gaussian, seen along `directions` or else from the camera."""
-    if directions is None:
-        center = camera.center.to(gaussians.means)
-        directions = torch.nn.functional.normalize(gaussians.means - center, dim=-1)
+def _shade(gaussians: Gaussians, camera: Camera) -> Float[Tensor, "n 3"]:
+    """Return the colour of each Gaussian, seen from the camera."""
+    center = camera.center.to(gaussians.means)
+    directions = torch.nn.functional.normalize(gaussians.means - center, dim=-1)
     return color_from_harmonics(gaussians.harmonics, directions)
 
 
 def _project(
-    gaussians: Gaussians, camera: Camera, dilation: float
-) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2 2"], Float[Tensor, " n"]]:
-    """Return means in pixels, covariances in pixels² (dilated) and camera depths in metres.
+    gaussians: Gaussians, camera: Camera, dilation: float, antialiased: bool
+) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2 2"], Float[Tensor, " n"], Float[Tensor, " n"]]:
+    """Return means in pixels, covariances in pixels² (dilated), camera depths in metres, and opacities.
 
     The perspective map is linearised at the mean, held inside the widened image (Zwicker et al. 2001).
+    Antialiased, dilation takes as much opacity as it adds area (Yu et al. 2024, Mip-Splatting).
     """
     transform, K = camera.T_camera_world.to(gaussians.means), camera.K.to(gaussians.means)
     focal, center = K[[0, 1], [0, 1]], K[:2, 2]
@@ -119,12 +146,18 @@ def _project(
     jacobian = torch.cat([torch.diag_embed(focal / z), -(focal * limited / z)[..., None]], -1)
     axes = matrix_from_quaternion(gaussians.rotations) * gaussians.scales[:, None, :]
     spread = jacobian @ transform[:3, :3] @ axes
-    covariances = spread @ spread.mT + dilation * torch.eye(2).to(spread)
-    return focal * tangents + center, covariances, z[:, 0]
+    covariances = spread @ spread.mT
+    dilated = covariances + dilation * torch.eye(2).to(spread)
+    opacities = gaussians.opacities
+    if antialiased:
+        # The cross product keeps the digits of a thin splat's determinant.
+        determinants = torch.linalg.cross(spread[:, 0], spread[:, 1]).square().sum(-1)
+        opacities = opacities * (determinants / torch.linalg.det(dilated)).sqrt()
+    return focal * tangents + center, dilated, z[:, 0], opacities
 
 
-def _composite_tile(splats: _Splats, left: int, top: int, camera: Camera) -> Float[Tensor, "h w 5"]:
-    """Blend splats over the tile at a corner; return red, green, blue, alpha and sum(weight z)."""
+def _blend_tile(splats: _Splats, left: int, top: int, camera: Camera) -> _Tile:
+    """Blend splats over the tile at a corner."""
     right, bottom = min(left + _TILE, camera.width), min(top + _TILE, camera.height)
     corners = torch.tensor([[left, top], [right, bottom]]).to(splats.means)
     touches = (splats.means + splats.radii > corners[0]) & (splats.means - splats.radii < corners[1])
@@ -141,4 +174,31 @@ def _composite_tile(splats: _Splats, left: int, top: int, camera: Camera) -> Flo
     weights = torch.where(after > TRANSMITTANCE_MIN, alphas * before, 0)
     features = splats.features[touches]
     color, depth = (weights.T @ features).split([3, 1], -1)
-    return torch.cat([color, weights.sum(0)[:, None], depth], -1).unflatten(0, (bottom - top, right - left))
+    image = torch.cat([color, weights.sum(0)[:, None], depth], -1)
+    blended = weights.detach() > 0
+    pixel, splat = blended.T.nonzero(as_tuple=True)
+    size = (bottom - top, right - left)
+    return _Tile(
+        image.unflatten(0, size),
+        _last_before_half(blended & (before > 0.5), features[:, 3].detach()).unflatten(0, size),
+        (y * camera.width + x).to(pixel.device).flatten()[pixel],
+        splats.ids[touches][splat],
+        weights.detach()[splat, pixel],
+    )
+
+
+def _last_before_half(candidates: Bool[Tensor, "n p"], depths: Float[Tensor, " n"]) -> Float[Tensor, " p"]:
+    """Return the depth of each pixel's last candidate, 0 where there is none."""
+    order = torch.arange(1, len(depths) + 1, device=depths.device)[:, None]
+    last = torch.cat([order.new_zeros(1, candidates.shape[1]), candidates * order]).amax(0)
+    return torch.cat([depths.new_zeros(1), depths])[last]
+
+
+def _join(tiles: list[_Tile], camera: Camera) -> Contributors:
+    """Return the tiles' pairs, pixel after pixel of the whole image."""
+    pixels, ids, weights = (
+        torch.cat([getattr(t, name) for t in tiles]) for name in ("pixels", "ids", "weights")
+    )
+    counts = torch.bincount(pixels, minlength=camera.width * camera.height)
+    order = pixels.argsort(stable=True)
+    return Contributors(counts.unflatten(0, (camera.height, camera.width)), ids[order], weights[order])

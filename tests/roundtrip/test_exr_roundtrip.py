@@ -20,7 +20,7 @@ def output() -> RenderOutput:
     color = torch.full((96, 128, 3), 0.5) * alpha[..., None]
     color[5, 7] = 2.0 * alpha[5, 7]
     depth = torch.linspace(1, 4, 96 * 128).reshape(96, 128)
-    return RenderOutput(color, alpha, depth)
+    return RenderOutput(color, alpha, depth, torch.tensor(0))
 
 
 @pytest.fixture
@@ -93,7 +93,7 @@ def test_header_matrices_reproduce_the_camera(output, camera, tmp_path):
 def test_acescg_moves_the_primaries_and_is_tagged(output, camera, tmp_path):
     red = torch.zeros(96, 128, 3)
     red[..., 0] = 0.5
-    image = RenderOutput(red, torch.full((96, 128), 0.5), output.depth)
+    image = RenderOutput(red, torch.full((96, 128), 0.5), output.depth, torch.tensor(0))
     path = _write(image, tmp_path, camera, colorspace="ACEScg")
     found = oiio.ImageBuf(str(path)).get_pixels(oiio.FLOAT)[0, 0, :4]
     # Rec.709 red in AP1, as published with ACES, at half coverage.

@@ -39,7 +39,7 @@ def test_a_missing_package_is_named_with_its_extra_before_any_work(
 
 def test_exr_without_openexr_names_the_extra(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
-    image = RenderOutput(torch.zeros(2, 2, 3), torch.zeros(2, 2), torch.zeros(2, 2))
+    image = RenderOutput(torch.zeros(2, 2, 3), torch.zeros(2, 2), torch.zeros(2, 2), torch.tensor(0))
     camera = Camera(torch.eye(3), torch.eye(4), 2, 2, "cam")
     with pytest.raises(MissingDependencyError, match=r"dsar-avatar\[exr\]"):
         write_exr(image, tmp_path / "a.exr", camera=camera, frame=1, fps=24.0, provenance={})

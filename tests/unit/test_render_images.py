@@ -15,7 +15,9 @@ from dsar_render import display_image, write_mp4, write_png, write_sheet
 def output() -> RenderOutput:
     """Orange that covers the columns by 0, 1/2 and 1."""
     alpha = torch.tensor([0.0, 0.5, 1.0]).expand(2, 3)
-    return RenderOutput(torch.tensor([1.0, 0.5, 0.0]) * alpha[..., None], alpha, torch.ones(2, 3))
+    return RenderOutput(
+        torch.tensor([1.0, 0.5, 0.0]) * alpha[..., None], alpha, torch.ones(2, 3), torch.tensor(0)
+    )
 
 
 def _decode(path, width, height) -> np.ndarray:

@@ -1,0 +1,148 @@
+"""The fast backend on NVIDIA GPUs: gsplat (Apache-2.0) behind the same signature, float32.
+
+gsplat is imported at the first image, and compiles its kernels at the first ever (minutes, with nvcc). Its
+constants are those of dsar.raster.conventions; its version is pinned, because 1.6 changed some of them.
+"""
+
+from collections.abc import Collection
+from functools import cache
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from dsar.errors import ConfigError, MissingDependencyError
+from dsar.raster.conventions import ALPHA_MAX, NEAR
+from dsar.types import Camera, Contributors, Gaussians, RenderOutput
+
+
+def rasterize_cuda(
+    gaussians: Gaussians,
+    camera: Camera,
+    background: Float[Tensor, "3"] | None,
+    dilation: float,
+    antialiased: bool,
+    outputs: Collection[str],
+) -> RenderOutput:
+    """Rasterise with gsplat: `dsar.raster.rasterize` without its checks, for float32 on a GPU.
+
+    Raises:
+        ConfigError: there is no GPU.
+        MissingDependencyError: gsplat is not installed or does not import.
+    """
+    gsplat = _load_gsplat()
+    sound = _hide_unsound(gaussians)
+    image, alpha, meta = gsplat.rasterization(
+        sound.means,
+        sound.rotations,
+        sound.scales,
+        sound.opacities,
+        sound.harmonics,
+        camera.T_camera_world.to(sound.means)[None],
+        camera.K.to(sound.means)[None],
+        camera.width,
+        camera.height,
+        near_plane=NEAR,
+        eps2d=dilation,
+        sh_degree=round(sound.harmonics.shape[1] ** 0.5) - 1,
+        packed=False,
+        render_mode="RGB+ED",
+        rasterize_mode="antialiased" if antialiased else "classic",
+    )
+    color, depth, alpha = image[0, ..., :3], image[0, ..., 3], alpha[0, ..., 0]
+    if background is not None:
+        color = color + (1 - alpha[..., None]) * background
+    drawn = (meta["radii"][0] > 0).all(-1).sum()
+    median = contributors = None
+    if outputs:
+        contributors, before = _find_contributors(gsplat, meta, camera)
+        if "median_depth" in outputs:
+            median = _median_depth(contributors, before, meta["depths"][0].detach())
+    return RenderOutput(
+        color,
+        alpha,
+        depth,
+        len(gaussians) - drawn,
+        median,
+        contributors if "contributors" in outputs else None,
+    )
+
+
+@cache
+def _load_gsplat() -> Any:
+    """Return the gsplat module, or say what is missing."""
+    # Before the import, which on a machine without a GPU fails in ways that differ from one to the next.
+    if not torch.cuda.is_available():
+        raise ConfigError(
+            "rasterize: the cuda backend needs an NVIDIA GPU and a CUDA build of torch; none found"
+        )
+    try:
+        import gsplat  # pyright: ignore[reportMissingImports]  # not where CI runs
+    except ImportError as error:
+        raise MissingDependencyError("the cuda backend of rasterize", "gsplat", "gpu") from error
+    return gsplat
+
+
+def _hide_unsound(gaussians: Gaussians) -> Gaussians:
+    """Return the same Gaussians, those that cannot be drawn replaced by a transparent one.
+
+    gsplat would blend what is not finite or has no size; were they taken out, the GPU would have to wait for
+    their number.
+    """
+    sound = (gaussians.scales > 0).all(-1) & (gaussians.rotations.norm(dim=-1) > 0)
+    for values in vars(gaussians).values():
+        sound &= values.detach().isfinite().view(len(values), -1).all(-1)
+
+    def replace(values: Tensor, substitute: float) -> Tensor:
+        return torch.where(sound.view(-1, *[1] * (values.ndim - 1)), values, substitute)
+
+    return Gaussians(
+        replace(gaussians.means, 0.0),
+        replace(gaussians.rotations, 1.0),
+        replace(gaussians.scales, 1.0),
+        replace(gaussians.opacities, 0.0),
+        replace(gaussians.harmonics, 0.0),
+    )
+
+
+@torch.no_grad()
+def _find_contributors(
+    gsplat: Any, meta: dict[str, Any], camera: Camera
+) -> tuple[Contributors, Float[Tensor, " m"]]:
+    """Return every pixel's Gaussians and weights, and the transmittance in front of each."""
+    width, height = camera.width, camera.height
+    means, conics, opacities = (meta[name].detach() for name in ("means2d", "conics", "opacities"))
+    ids, pixels, _ = gsplat.rasterize_to_indices_in_range(
+        0, 2**31 - 1, means.new_ones(1, height, width), means, conics, opacities.contiguous(), width, height,
+        meta["tile_size"], meta["isect_offsets"], meta["flatten_ids"],
+    )  # fmt: skip
+    dx, dy = means[0, ids, 0] - (pixels % width + 0.5), means[0, ids, 1] - (pixels // width + 0.5)
+    a, b, c = conics[0, ids].unbind(-1)
+    alphas = opacities[0, ids] * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
+    alphas = alphas.clamp_max(ALPHA_MAX).double()
+    counts = torch.bincount(pixels, minlength=width * height)
+    before = _transmittance(alphas, counts)
+    weights = (alphas * before).float()
+    return Contributors(counts.unflatten(0, (height, width)), ids, weights), before.float()
+
+
+def _transmittance(alphas: Float[Tensor, " m"], counts: Int[Tensor, " p"]) -> Float[Tensor, " m"]:
+    """Return the product of 1 - alpha over what is in front in the same pixel."""
+    # One running sum over the image; float64 keeps its digits from pixel to pixel.
+    passed = torch.cat([alphas.new_zeros(1), torch.log1p(-alphas).cumsum(0)])
+    starts = counts.cumsum(0) - counts
+    return torch.exp(passed[:-1] - passed[starts].repeat_interleave(counts))
+
+
+@torch.no_grad()
+def _median_depth(
+    contributors: Contributors, before: Float[Tensor, " m"], depths: Float[Tensor, " n"]
+) -> Float[Tensor, "h w"]:
+    """Return the depth of each pixel's last Gaussian that over half of the light reaches, 0 without any."""
+    counts = contributors.counts.flatten()
+    pixels = torch.arange(len(counts), device=counts.device).repeat_interleave(counts)
+    place = torch.where(before > 0.5, torch.arange(1, len(before) + 1, device=counts.device), 0)
+    last = torch.zeros_like(counts).scatter_reduce(0, pixels, place.to(counts.dtype), "amax")
+    values = torch.cat([depths.new_zeros(1), depths[contributors.ids]])
+    return values[last].view(contributors.counts.shape)
