@@ -11,6 +11,8 @@ import numba
 import numpy as np
 import torch
 
+_WAIT_POLICY = os.environ.get("OMP_WAIT_POLICY", "default")
+"""How torch's idle threads wait: what the environment said when torch was imported."""
 _ACCUMULATORS = 128
 _CHAIN = 4
 """Multiply-adds per accumulator between its load and its store, so that neither limits the rate."""
@@ -28,7 +30,7 @@ def describe_machine() -> dict:
         "cpu": _find_cpu(),
         "cores": os.cpu_count(),
         "system": platform.platform(),
-        "omp_wait_policy": os.environ.get("OMP_WAIT_POLICY"),
+        "omp_wait_policy": _WAIT_POLICY,
     }
 
 

@@ -5,8 +5,13 @@
 A body-like shell of Gaussians, forward and forward + backward by every field (from a gradient of the colour
 image), projection and colour included. Medians and quartiles, with one thread and with two.
 The rivals are those of benchmarks/rivals; `pip install -c constraints.txt -e '.[bench]'` brings their
-packages. On a busy machine set OMP_WAIT_POLICY=passive, or torch's idle threads take the cores from others.
+packages. Torch with two threads is timed as it comes, with idle threads that spin: while other processes want
+the cores, single runs of it take ten times as long.
 """
+
+# First, because it imports torch before dsar does: dsar lets torch's idle threads sleep, and so plain torch
+# would take two to three times as long with two threads as its other users see.
+from machine import count_memory, describe_machine, measure_peak, read_load  # isort: skip
 
 import argparse
 import gc
@@ -22,7 +27,6 @@ import numba
 import numpy as np
 import torch
 from fragments import Work, count_work
-from machine import count_memory, describe_machine, measure_peak, read_load
 from report import describe_arithmetic, describe_ratio, describe_rival, describe_row
 from rivals import NOT_COMPARED, OURS, RIVALS, Rival, Scene
 from scene import make_body, make_camera
