@@ -27,9 +27,10 @@ import numba
 import numpy as np
 import torch
 from fragments import Work, count_work
-from report import describe_arithmetic, describe_ratio, describe_rival, describe_row
+from report import describe_arithmetic, describe_ratio, describe_rival, describe_row, describe_stages
 from rivals import NOT_COMPARED, OURS, RIVALS, Rival, Scene
 from scene import make_body, make_camera
+from stages import measure_stages
 from timing import time_once, time_runs
 
 FLOP_PER_FRAGMENT = 36
@@ -59,6 +60,7 @@ class Plan:
     slowest_s: float
     """A pass that takes longer than this is left out."""
     peak_repeats: int
+    stage_repeats: int
     threads: tuple[int, ...]
 
 
@@ -77,6 +79,7 @@ FULL = Plan(
     most_runs=100,
     slowest_s=30,
     peak_repeats=10,
+    stage_repeats=20,
     threads=(1, 2),
 )
 QUICK = Plan(
@@ -85,6 +88,7 @@ QUICK = Plan(
     most_runs=30,
     slowest_s=1.5,
     peak_repeats=3,
+    stage_repeats=10,
     threads=(2,),
 )
 PASSES = ("forward", "forward_backward")
@@ -219,6 +223,19 @@ def find_arithmetic(rows: list[dict], scenes: list[dict], peaks: dict[int, float
     return found
 
 
+def find_stages(plan: Plan, threads: list[int], peaks: dict[int, float]) -> list[dict]:
+    """Return where our time goes, kernel by kernel."""
+    found = []
+    for size in plan.sizes:
+        for count in threads:
+            use_threads(count)
+            stages = measure_stages(make_body(size[0]), make_camera(*size[1:]), plan.stage_repeats)
+            case = dict(zip(("gaussians", "width", "height"), size, strict=True)) | {"threads": count}
+            share = {name: rate / peaks[count] for name, rate in stages.gflops.items()}
+            found.append(case | asdict(stages) | {"share_of_peak": share})
+    return found
+
+
 def write_json(found: dict, path: Path) -> None:
     """Write what was found, whole or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -246,7 +263,8 @@ def main() -> None:
     peaks = {count: measure_peak(count, plan.peak_repeats) for count in threads}
     rows, scenes = run(plan, threads, [rival for rival in RIVALS if rival.name in fit])
     found |= {"peak_gflops": peaks, "rows": rows, "scenes": scenes, "ratios": find_ratios(rows)}
-    found |= {"arithmetic": find_arithmetic(rows, scenes, peaks), "load_after": read_load()}
+    found |= {"arithmetic": find_arithmetic(rows, scenes, peaks)}
+    found |= {"stages": find_stages(plan, threads, peaks), "load_after": read_load()}
     if arguments.json:
         write_json(found, arguments.json)
     if arguments.chart:
@@ -256,6 +274,7 @@ def main() -> None:
         draw_charts(rows, found["ratios"], OURS.name, arguments.chart)
     print(*(f"Peak, {count} thread(s): {peak:.0f} GFLOP/s" for count, peak in peaks.items()), sep="\n")
     print(f"Counted: {COUNTED}", *map(describe_arithmetic, found["arithmetic"]), sep="\n")
+    print(*map(describe_stages, found["stages"]), sep="\n")
     best = [r for r in found["ratios"] if r["threads"] == threads[-1] and r["pass"] == "forward_backward"]
     for ratio in sorted(best, key=is_headline):
         print(describe_ratio(ratio))

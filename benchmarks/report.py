@@ -39,3 +39,13 @@ def describe_ratio(row: dict) -> str:
         f"cpu is {row['ratio']:.0f}x as fast as {row['rival']}, {row['pass'].replace('_', ' + ')} of "
         f"{row['gaussians']} at {row['width']} x {row['height']}, {row['threads']} threads"
     )
+
+
+def describe_stages(row: dict) -> str:
+    """Return where the time of one scene goes."""
+    times = ", ".join(f"{name.removesuffix('_part')} {ms:.2f}" for name, ms in row["median_ms"].items())
+    shares = " and ".join(f"{100 * share:.0f} %" for share in row["share_of_peak"].values())
+    return (
+        f"cpu stages, {describe_size(row)}, {row['threads']} thread(s), ms: {times}; blending forward and "
+        f"backward at {shares} of the peak ({1e-6 * row['lanes']:.2f} M lanes)"
+    )

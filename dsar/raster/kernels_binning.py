@@ -16,7 +16,7 @@ import numpy as np
 from dsar.raster.conventions import ALPHA_MIN
 from dsar.raster.jit import inlined, kernel
 from dsar.raster.simd import LANES, bits_of, larger, load, prefetch, smaller, spread, square_root
-from dsar.raster.tiles import BLOCK_HEIGHT, BLOCK_WIDTH, COLUMNS, STRIPS, TILE
+from dsar.raster.tiles import BLOCK_HEIGHT, BLOCK_WIDTH, COLUMNS, STRIPS, TILE, TILE_BITS
 
 FIRST_ROWS = np.array([BLOCK_HEIGHT * strip + 0.5 for strip in range(LANES)], np.float32)
 """Centre of each strip's first pixel row, from the tile's top; lanes beyond the last strip are not used."""
@@ -68,27 +68,28 @@ def _fetch_ahead(records, order, k):
 @inlined
 def _tile_span(bounds, i):
     """Return the first and end tile column and the first and end tile row that a splat touches."""
+    last = np.int32(TILE - 1)
     return (
-        bounds[i, 0] // TILE,
-        (bounds[i, 1] - 1) // TILE + 1,
-        bounds[i, 2] // TILE,
-        (bounds[i, 3] - 1) // TILE + 1,
+        bounds[i, 0] >> TILE_BITS,
+        (bounds[i, 1] + last) >> TILE_BITS,
+        bounds[i, 2] >> TILE_BITS,
+        (bounds[i, 3] + last) >> TILE_BITS,
     )
 
 
 @kernel
 def count_pairs_part(part, parts, order, records, bounds, tiles_x, counts, tiles):
     """Count the splats that one part will deal to every tile (counts[part]), and the tiles of each splat."""
-    n, flat = len(order), records.reshape(-1)
-    counts[part] = 0
+    n, flat, counts = len(order), records.reshape(-1), counts[part]
+    counts[:] = 0
     for k in range(n * part // parts, n * (part + 1) // parts):
         _fetch_ahead(flat, order, k)
-        i = order[k]
+        i = np.uint64(order[k])
         x0, x1, y0, y1 = _tile_span(bounds, i)
         tiles[i] = (x1 - x0) * (y1 - y0)
         for row in range(y0, y1):
             for tile in range(row * tiles_x + x0, row * tiles_x + x1):
-                counts[part, tile] += 1
+                counts[np.uint64(tile)] += 1
 
 
 @kernel
@@ -116,27 +117,23 @@ def place_pairs(counts, tiles):
 
 @inlined
 def _outline(records, i, top, first_rows):
-    """Return where the splat's outline begins and ends in each strip of a tile (x, infinite if it does not).
+    """Return the x where a splat's outline begins and ends in each strip of a tile, and where it meets them.
 
-    The outline alpha = ALPHA_MIN is e1² + e2² = reach². At a given dy = mean y - pixel y it spans
-    dx = (shear dy ± sqrt(reach² - e2²)) / stretch, and most where dy is ± shear reach / (height
-    hypot(height, shear)).
+    On the outline alpha is ALPHA_MIN: log2 opacity - e1² - e2² = log2 ALPHA_MIN. At dy = mean y - pixel y it
+    spans dx = (shear dy ± sqrt(log2 (opacity / ALPHA_MIN) - e2²)) / stretch, most of all where dy is ± lift.
     """
-    stretch, shear, height = records[i, 2], records[i, 3], records[i, 4]
-    squared = max(records[i, 5] - _LOG_ALPHA_MIN, _ZERO)
-    reach = math.sqrt(squared)
-    lift = shear * reach / (height * math.sqrt(height * height + shear * shear))
-    limit = spread(reach / height)
+    height, limit, lift = records[i, 4], spread(records[i, 10]), spread(records[i, 11])
+    log_ratio, width = records[i, 5] - _LOG_ALPHA_MIN, np.float32(1) / records[i, 2]
     highest = records[i, 1] - top - load(first_rows, np.uint64(0))
     lowest = highest - np.float32(BLOCK_HEIGHT - 1)
-    touched = (lowest - _SLACK <= limit) & (highest + _SLACK >= _ZERO - limit)
-    low, high = larger(lowest, _ZERO - limit), smaller(highest, limit)
-    right, left = smaller(larger(spread(lift), low), high), smaller(larger(spread(-lift), low), high)
-    width = np.float32(1) / stretch
-    reach_right = square_root(larger(squared - height * height * right * right, spread(_ZERO)))
-    reach_left = square_root(larger(squared - height * height * left * left, spread(_ZERO)))
-    begin = records[i, 0] - (shear * right + reach_right) * width - _SLACK
-    end = records[i, 0] - (shear * left - reach_left) * width + _SLACK
+    touched = (lowest - _SLACK <= limit) & (highest + _SLACK >= -limit)
+    low, high = larger(lowest, -limit), smaller(highest, limit)
+    right, left = smaller(larger(lift, low), high), smaller(larger(-lift, low), high)
+    e2_right, e2_left = height * right, height * left
+    reach_right = square_root(larger(log_ratio - e2_right * e2_right, spread(_ZERO)))
+    reach_left = square_root(larger(log_ratio - e2_left * e2_left, spread(_ZERO)))
+    begin = records[i, 0] - _SLACK - width * (records[i, 3] * right + reach_right)
+    end = records[i, 0] + _SLACK - width * (records[i, 3] * left - reach_left)
     return begin, end, touched
 
 
@@ -145,10 +142,10 @@ def deal_pairs_part(
     part, parts, order, records, bounds, tiles_x, first_rows, cursors, splat_starts, pairs, places
 ):
     """Write one part's pairs into the tiles' lists, and their places with the splats."""
-    n, flat = len(order), records.reshape(-1)
+    n, flat, cursors = len(order), records.reshape(-1), cursors[part]
     for k in range(n * part // parts, n * (part + 1) // parts):
         _fetch_ahead(flat, order, k)
-        i = order[k]
+        i = np.uint64(order[k])
         x0, x1, y0, y1 = _tile_span(bounds, i)
         own = splat_starts[i]
         for row in range(y0, y1):
@@ -160,8 +157,9 @@ def deal_pairs_part(
                     first = left + np.float32(block * BLOCK_WIDTH)
                     meets = touched & (begin <= first + np.float32(BLOCK_WIDTH - 1)) & (end >= first)
                     blocks |= (bits_of(meets) & _ALL_STRIPS) << np.uint32(block * STRIPS)
-                place = cursors[part, row * tiles_x + column]
-                cursors[part, row * tiles_x + column] = place + 1
+                tile = np.uint64(row * tiles_x + column)
+                place = np.uint64(cursors[tile])
+                cursors[tile] += 1
                 pairs[place, 0], pairs[place, 1] = i, blocks
                 places[own] = place
                 own += 1

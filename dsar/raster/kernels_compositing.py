@@ -5,8 +5,9 @@ the blocks that it touches, and every step of the blending is one instruction fo
 is finished stays among its block's lanes: its transmittance is kept negative, which makes every later splat
 fail the test `T (1 - alpha) > minimum`. Every few splats, blocks without a live pixel leave the tile's set.
 
-The backward pass walks front to back again and needs one running scalar per pixel: with q the splat's colour
-and depth times the pixel's gradient and `rest` what all splats behind it contribute to the loss,
+The backward pass walks front to back again and needs one running scalar per pixel: with q the splat's colour,
+and how far it is behind the pixel's depth, times the pixel's gradient, and `rest` what all splats behind it
+contribute to the loss,
 
     dL/dalpha = q T - rest / (1 - alpha).
 
@@ -48,9 +49,11 @@ _T, _X, _Y = (np.uint64(plane * LANES) for plane in (0, 1, 2))
 # Forward: what has been blended so far.
 _RED, _GREEN, _BLUE, _DEPTH = (np.uint64(plane * LANES) for plane in (3, 4, 5, 6))
 _FORWARD = np.uint64(7 * LANES)
-# Backward: the gradient that arrives at the pixel, and `rest`.
-_V_RED, _V_GREEN, _V_BLUE, _V_DEPTH, _REST = (np.uint64(plane * LANES) for plane in (3, 4, 5, 6, 7))
-_BACKWARD = np.uint64(8 * LANES)
+# Backward: the gradient that arrives at the pixel, that of depth times depth, and `rest`.
+_V_RED, _V_GREEN, _V_BLUE, _V_DEPTH, _LEVEL, _REST = (
+    np.uint64(plane * LANES) for plane in (3, 4, 5, 6, 7, 8)
+)
+_BACKWARD = np.uint64(9 * LANES)
 # Survey: depth at half transmittance, and how many splats were blended. Collecting needs no plane of its own.
 _MEDIAN, _COUNT = (np.uint64(plane * LANES) for plane in (3, 4))
 _SURVEY, _COLLECT = np.uint64(5 * LANES), np.uint64(3 * LANES)
@@ -226,7 +229,8 @@ def _blend_splat_backward(state, blocks, records, i, left, top, out):
         blocks &= blocks - np.uint32(1)
         e1, e2, alpha, weight, before = _blend(state, start, *splat)
         q = red * load(state, start + _V_RED) + green * load(state, start + _V_GREEN)
-        q += blue * load(state, start + _V_BLUE) + z * load(state, start + _V_DEPTH)
+        q += blue * load(state, start + _V_BLUE)
+        q += z * load(state, start + _V_DEPTH) - load(state, start + _LEVEL)
         rest = load(state, start + _REST) - weight * q
         store(state, start + _REST, rest)
         v_red += weight * load(state, start + _V_RED)
@@ -255,21 +259,19 @@ def _load_gradients(state, left, top, color, alpha, depth, v_color, v_alpha, v_d
     for y in range(top, min(top + TILE, height)):
         for x in range(left, min(left + TILE, width)):
             pixel = _pixel(x - left, y - top, _BACKWARD)
-            red, green, blue, v_z, rest, v_through = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
+            red, green, blue, v_z, rest = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
             if len(v_alpha) > 0:
-                v_through -= v_alpha[y, x]
+                rest -= (_ONE - alpha[y, x]) * v_alpha[y, x]
             if len(v_depth) > 0 and alpha[y, x] > _ZERO:
-                # depth = sum(weight z) / alpha
+                # depth = sum(weight z) / sum(weight)
                 v_z = v_depth[y, x] / alpha[y, x]
-                v_through += v_z * depth[y, x]
-                rest += v_depth[y, x] * depth[y, x]
             if len(v_color) > 0:
                 red, green, blue = v_color[y, x, 0], v_color[y, x, 1], v_color[y, x, 2]
                 # The colour holds the background already, so its share of `rest` is included.
                 rest += red * color[y, x, 0] + green * color[y, x, 1] + blue * color[y, x, 2]
             state[pixel + _V_RED], state[pixel + _V_GREEN], state[pixel + _V_BLUE] = red, green, blue
-            state[pixel + _V_DEPTH] = v_z
-            state[pixel + _REST] = rest + (_ONE - alpha[y, x]) * v_through
+            state[pixel + _V_DEPTH], state[pixel + _LEVEL] = v_z, v_z * depth[y, x]
+            state[pixel + _REST] = rest
 
 
 @kernel

@@ -6,9 +6,9 @@ d = mean - pixel:
     e1 = stretch dx - shear dy,  e2 = height dy,  log2 alpha = log2 opacity - e1² - e2².
 
 Unlike the conic (a, b, c) this cannot turn negative by rounding, however thin the splat. A splat's record is
-mean x, mean y, stretch, shear, height, log2 opacity, red, green, blue, z (two are not used) and, as integers,
-its bounds: pixels first x, end x, first y, end y, all 0 if the Gaussian is not drawn; a cache line in all.
-The colour is left to kernels_shading.
+mean x, mean y, stretch, shear, height, log2 opacity, red, green, blue, z, limit, lift and, as integers, its
+bounds: pixels first x, end x, first y, end y, all 0 if the Gaussian is not drawn; a cache line in all. Limit
+is the largest dy on the splat's outline, lift the dy where dx is largest. Colour is left to kernels_shading.
 
 Gaussians go through LANES at a time: their rows are first laid out as planes of a scratch array. Every kernel
 takes `part` of `parts` and touches only those rows, so results do not depend on their number. The camera is
@@ -46,12 +46,22 @@ _ZERO, _HALF, _ONE, _TWO = (np.float32(value) for value in (0.0, 0.5, 1.0, 2.0))
 # Scratch planes: what comes in (mean, rotation, scales, opacity, then the sums of the backward pass) ...
 _MEAN, _ROTATION, _SCALES, _OPACITY, _SUMS = 0, 3, 7, 10, 11
 # ... and, over it, what goes out: records and bounds, or gradients in the order of the inputs.
-_BOUNDS, _PLANES = 10, 21
+_BOUNDS, _PLANES = 12, 21
 
 
 @inlined
 def _dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@inlined
+def _sum(a, b):
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+@inlined
+def _cross(a, b):
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 @inlined
@@ -162,18 +172,22 @@ def _scaled(g, scales):
 
 
 @inlined
-def _covariance(m1, m2, dilation):
+def _normal(g1, g2, scales):
+    """Return the cross product of the covariance's factors, g1 scales and g2 scales, with all its digits."""
+    w = _cross(g1, g2)
+    return scales[1] * scales[2] * w[0], scales[2] * scales[0] * w[1], scales[0] * scales[1] * w[2]
+
+
+@inlined
+def _covariance(m1, m2, normal, dilation):
     """Return (A, B, C, A - B²/C) of the dilated image-plane covariance [[A, B], [B, C]], pixels².
 
-    And its determinant before dilation, from the cross product, which keeps its digits for thin splats.
+    The determinant before dilation is normal²; unlike A C - B² it keeps its digits for thin splats.
     """
     a0, b, c0 = _dot(m1, m1), _dot(m1, m2), _dot(m2, m2)
-    nx = m1[1] * m2[2] - m1[2] * m2[1]
-    ny = m1[2] * m2[0] - m1[0] * m2[2]
-    nz = m1[0] * m2[1] - m1[1] * m2[0]
     c = c0 + dilation
-    thin = nx * nx + ny * ny + nz * nz
-    return a0 + dilation, b, c, (thin + dilation * (a0 + c0) + dilation * dilation) / c, thin
+    determinant = _dot(normal, normal) + dilation * (a0 + c0) + dilation * dilation
+    return a0 + dilation, b, c, determinant / c
 
 
 @inlined
@@ -194,10 +208,11 @@ def _project(scratch, camera, width, height):
     w, x, y, z, _ = _unit_quaternion(scratch)
     rows = _rotation_rows(w, x, y, z)
     u1, u2, _, _ = _image_axes(point, camera, width, height)
-    m1, m2 = _scaled(_times_matrix(u1, rows), scales), _scaled(_times_matrix(u2, rows), scales)
-    a, b, c, slim, thin = _covariance(m1, m2, camera[16])
+    g1, g2 = _times_matrix(u1, rows), _times_matrix(u2, rows)
+    normal = _normal(g1, g2, scales)
+    a, b, c, slim = _covariance(_scaled(g1, scales), _scaled(g2, scales), normal, camera[16])
     if camera[17] > _ZERO:
-        opacity = opacity * square_root(thin / (slim * c))
+        opacity = opacity * square_root(_dot(normal, normal) / (slim * c))
     mean_x = camera[12] * point[0] / point[2] + camera[14]
     mean_y = camera[13] * point[1] / point[2] + camera[15]
     log_opacity = log_two(opacity)
@@ -217,6 +232,8 @@ def _project(scratch, camera, width, height):
     _write(scratch, 4, square_root(_HALF * _LOG2_E / c))
     _write(scratch, 5, log_opacity)
     _write(scratch, 9, point[2])
+    _write(scratch, 10, square_root(reach * c))
+    _write(scratch, 11, b * square_root(reach / a))
     nothing = spread(_ZERO)
     _write(scratch, _BOUNDS, choose(drawn, x0, nothing))
     _write(scratch, _BOUNDS + 1, choose(drawn, x1, nothing))
@@ -301,6 +318,20 @@ def _write_mean_gradient(scratch, point, camera, u1, u2, free_x, free_y, v_u1, v
 
 
 @inlined
+def _normal_gradient(v_log, normal, g1, g2, scales):
+    """Return the gradients of v_log * log |normal| by scales, g1 and g2."""
+    x, y, z = normal[0] * normal[0], normal[1] * normal[1], normal[2] * normal[2]
+    share = v_log / (x + y + z)
+    v_scales = share * (y + z) / scales[0], share * (z + x) / scales[1], share * (x + y) / scales[2]
+    v_w = (
+        share * normal[0] * scales[1] * scales[2],
+        share * normal[1] * scales[2] * scales[0],
+        share * normal[2] * scales[0] * scales[1],
+    )
+    return v_scales, _cross(g2, v_w), _cross(v_w, g1)
+
+
+@inlined
 def _project_backward(scratch, camera, width, height):
     """Replace Gaussians in the scratch planes by their gradients."""
     mean, scales, opacity = _planes(scratch, _MEAN), _planes(scratch, _SCALES), _plane(scratch, _OPACITY)
@@ -310,14 +341,14 @@ def _project_backward(scratch, camera, width, height):
     u1, u2, free_x, free_y = _image_axes(point, camera, width, height)
     g1, g2 = _times_matrix(u1, rows), _times_matrix(u2, rows)
     m1, m2 = _scaled(g1, scales), _scaled(g2, scales)
-    a, b, c, slim, thin = _covariance(m1, m2, camera[16])
+    normal = _normal(g1, g2, scales)
+    a, b, c, slim = _covariance(m1, m2, normal, camera[16])
     v_x, v_y, v_a, v_b, v_c = _splat_gradient(scratch, a, b, c, slim)
-    if camera[17] > _ZERO:
-        # opacity² is proportional to thin / (slim c), and thin is that determinant without dilation.
-        v_log, whole = -(_HALF * _plane(scratch, _SUMS)), slim * c
-        v_a += v_log * ((c - camera[16]) / thin - c / whole)
-        v_c += v_log * ((a - camera[16]) / thin - a / whole)
-        v_b += v_log * _TWO * b * (_ONE / whole - _ONE / thin)
+    # Antialiased, opacity is proportional to |normal| / sqrt(slim c).
+    v_log = -_plane(scratch, _SUMS) if camera[17] > _ZERO else spread(_ZERO)
+    v_a += -(_HALF * v_log / slim)
+    v_b += v_log * b / (slim * c)
+    v_c += -(_HALF * v_log * a / (slim * c))
     twice_a, twice_c = _TWO * v_a, _TWO * v_c
     v_m1 = (
         twice_a * m1[0] + v_b * m2[0],
@@ -329,10 +360,18 @@ def _project_backward(scratch, camera, width, height):
         twice_c * m2[1] + v_b * m1[1],
         twice_c * m2[2] + v_b * m1[2],
     )
-    _write(scratch, _SCALES, v_m1[0] * g1[0] + v_m2[0] * g2[0])
-    _write(scratch, _SCALES + 1, v_m1[1] * g1[1] + v_m2[1] * g2[1])
-    _write(scratch, _SCALES + 2, v_m1[2] * g1[2] + v_m2[2] * g2[2])
+    v_scales = (
+        v_m1[0] * g1[0] + v_m2[0] * g2[0],
+        v_m1[1] * g1[1] + v_m2[1] * g2[1],
+        v_m1[2] * g1[2] + v_m2[2] * g2[2],
+    )
     v_g1, v_g2 = _scaled(v_m1, scales), _scaled(v_m2, scales)
+    if camera[17] > _ZERO:
+        extra, extra1, extra2 = _normal_gradient(v_log, normal, g1, g2, scales)
+        v_scales, v_g1, v_g2 = _sum(v_scales, extra), _sum(v_g1, extra1), _sum(v_g2, extra2)
+    _write(scratch, _SCALES, v_scales[0])
+    _write(scratch, _SCALES + 1, v_scales[1])
+    _write(scratch, _SCALES + 2, v_scales[2])
     _write_rotation_gradient(scratch, u1, u2, v_g1, v_g2, quaternion)
     v_u1 = (_dot(rows[0], v_g1), _dot(rows[1], v_g1), _dot(rows[2], v_g1))
     v_u2 = (_dot(rows[0], v_g2), _dot(rows[1], v_g2), _dot(rows[2], v_g2))

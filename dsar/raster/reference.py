@@ -108,7 +108,8 @@ def _find_drawable(
     means, covariances, depths, opacities = _project(gaussians, camera, dilation, antialiased)
     drawable = (depths > NEAR) & (opacities >= ALPHA_MIN) & (gaussians.scales > 0).all(-1)
     drawable &= gaussians.rotations.norm(dim=-1) > 0
-    for values in (means, covariances.flatten(1), opacities[:, None], _shade(gaussians, camera)):
+    # Harmonics and not colours, whose clamp would make 0 of minus infinity.
+    for values in (means, covariances.flatten(1), opacities[:, None], gaussians.harmonics.flatten(1)):
         drawable &= values.isfinite().all(-1)
     return drawable
 

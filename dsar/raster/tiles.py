@@ -6,7 +6,8 @@ for the block in that column and strip (row of blocks) of the tile.
 
 from dsar.raster.simd import LANES
 
-TILE = 16
+TILE_BITS = 4
+TILE = 1 << TILE_BITS
 """Pixels along a tile's side."""
 BLOCK_WIDTH = 4
 BLOCK_HEIGHT = LANES // BLOCK_WIDTH

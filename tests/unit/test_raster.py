@@ -163,7 +163,8 @@ def test_any_image_size_works(size):
     assert (fast_gradients["means"] - slow_gradients["means"]).norm() <= 1e-3 * slow_gradients["means"].norm()
 
 
-def test_reference_gradients_equal_finite_differences():
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_reference_gradients_equal_finite_differences(antialiased):
     # Wide and faint splats on a small image: no fragment is near a cut-off, where the image jumps.
     camera = make_camera(4, 3, focal=5.0, off_center=(0.3, -0.2))
     camera = dataclasses.replace(camera, K=camera.K.double(), T_camera_world=camera.T_camera_world.double())
@@ -171,7 +172,13 @@ def test_reference_gradients_equal_finite_differences():
     background = torch.tensor([0.1, 0.6, 0.3], dtype=torch.float64, requires_grad=True)
 
     def render(*values):
-        output = rasterize(Gaussians(*values[:-1]), camera, background=values[-1], backend="reference")
+        output = rasterize(
+            Gaussians(*values[:-1]),
+            camera,
+            background=values[-1],
+            backend="reference",
+            antialiased=antialiased,
+        )
         return output.color, output.alpha, output.depth
 
     leaves = [getattr(gaussians, field).requires_grad_() for field in FIELDS]
