@@ -12,10 +12,12 @@ from torch import Tensor
 
 from dsar.geometry.harmonics import rotate_harmonics
 from dsar.geometry.rotations import quaternion_multiply
-from dsar.raster.jit import kernel
+from dsar.raster.jit import inlined, kernel
+from dsar.raster.simd import LANES, choose, load, square_root, store
 from dsar.types import Gaussians
 
 _POLAR_STEPS = 6
+_ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
 
 
 def pose_gaussians(
@@ -49,33 +51,53 @@ def nearest_quaternions(matrices: Float[Tensor, "b n 3 3"]) -> Float[Tensor, "b 
 
 @kernel
 def _nearest_quaternions(matrices):
-    """Polar factor by Newton's iteration R <- (R + R^-T) / 2 (Higham 1986), then Shepperd's quaternion."""
-    count = matrices.shape[0]
-    result = np.empty((count, 4), np.float32)
-    for i in range(count):
-        a, b, c = float(matrices[i, 0]), float(matrices[i, 1]), float(matrices[i, 2])
-        d, e, f = float(matrices[i, 3]), float(matrices[i, 4]), float(matrices[i, 5])
-        g, h, k = float(matrices[i, 6]), float(matrices[i, 7]), float(matrices[i, 8])
-        for _ in range(_POLAR_STEPS):
-            # Cofactors over the determinant are the inverse transpose.
-            ca, cb, cc = e * k - f * h, f * g - d * k, d * h - e * g
-            cd, ce, cf = c * h - b * k, a * k - c * g, b * g - a * h
-            cg, ch, ck = b * f - c * e, c * d - a * f, a * e - b * d
-            inverse = 0.5 / (a * ca + b * cb + c * cc)
-            a, b, c = 0.5 * a + ca * inverse, 0.5 * b + cb * inverse, 0.5 * c + cc * inverse
-            d, e, f = 0.5 * d + cd * inverse, 0.5 * e + ce * inverse, 0.5 * f + cf * inverse
-            g, h, k = 0.5 * g + cg * inverse, 0.5 * h + ch * inverse, 0.5 * k + ck * inverse
-        ww, xx, yy, zz = 1 + a + e + k, 1 + a - e - k, 1 - a + e - k, 1 - a - e + k
-        if ww >= xx and ww >= yy and ww >= zz:
-            w, x, y, z = ww, h - f, c - g, d - b
-        elif xx >= yy and xx >= zz:
-            w, x, y, z = h - f, xx, b + d, c + g
-        elif yy >= zz:
-            w, x, y, z = c - g, b + d, yy, f + h
-        else:
-            w, x, y, z = d - b, c + g, f + h, zz
-        norm = 1.0 / np.sqrt(w * w + x * x + y * y + z * z)
-        if w < 0:
-            norm = -norm
-        result[i, 0], result[i, 1], result[i, 2], result[i, 3] = w * norm, x * norm, y * norm, z * norm
+    """Return each matrix's nearest rotation as a quaternion; LANES of them go through at a time."""
+    count = len(matrices)
+    result, scratch = np.empty((count, 4), np.float32), np.empty(9 * LANES, np.float32)
+    for start in range(0, count, LANES):
+        for lane in range(LANES):
+            for k in range(9):
+                scratch[k * LANES + lane] = matrices[min(start + lane, count - 1), k]
+        _find_quaternions(scratch)
+        for lane in range(min(LANES, count - start)):
+            for k in range(4):
+                result[start + lane, k] = scratch[k * LANES + lane]
     return result
+
+
+@inlined
+def _find_quaternions(scratch):
+    """Replace matrices by quaternions: Newton's R <- (R + R^-T) / 2 (Higham 1986), then Shepperd's method."""
+    a, b, c = _planes(scratch, 0)
+    d, e, f = _planes(scratch, 3)
+    g, h, k = _planes(scratch, 6)
+    for _ in range(_POLAR_STEPS):
+        # Cofactors over the determinant are the inverse transpose.
+        ca, cb, cc = e * k - f * h, f * g - d * k, d * h - e * g
+        cd, ce, cf = c * h - b * k, a * k - c * g, b * g - a * h
+        cg, ch, ck = b * f - c * e, c * d - a * f, a * e - b * d
+        inverse = _HALF / (a * ca + b * cb + c * cc)
+        a, b, c = _HALF * a + ca * inverse, _HALF * b + cb * inverse, _HALF * c + cc * inverse
+        d, e, f = _HALF * d + cd * inverse, _HALF * e + ce * inverse, _HALF * f + cf * inverse
+        g, h, k = _HALF * g + cg * inverse, _HALF * h + ch * inverse, _HALF * k + ck * inverse
+    ww, xx, yy, zz = a + e + k + _ONE, a - e - k + _ONE, e - a - k + _ONE, k - a - e + _ONE
+    # Whichever is largest has the most digits, and the others follow from it.
+    from_w, from_x, from_y = (ww >= xx) & (ww >= yy) & (ww >= zz), (xx >= yy) & (xx >= zz), yy >= zz
+    w = choose(from_w, ww, choose(from_x, h - f, choose(from_y, c - g, d - b)))
+    x = choose(from_w, h - f, choose(from_x, xx, choose(from_y, b + d, c + g)))
+    y = choose(from_w, c - g, choose(from_x, b + d, choose(from_y, yy, f + h)))
+    z = choose(from_w, d - b, choose(from_x, c + g, choose(from_y, f + h, zz)))
+    norm = _ONE / square_root(w * w + x * x + y * y + z * z)
+    norm = choose(w < _ZERO, -norm, norm)
+    for place, value in enumerate((w, x, y, z)):
+        store(scratch, np.uint64(place * LANES), value * norm)
+
+
+@inlined
+def _planes(scratch, first):
+    """Return three consecutive planes."""
+    return (
+        load(scratch, np.uint64(first * LANES)),
+        load(scratch, np.uint64((first + 1) * LANES)),
+        load(scratch, np.uint64((first + 2) * LANES)),
+    )

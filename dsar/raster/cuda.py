@@ -14,6 +14,7 @@ from torch import Tensor
 
 from dsar.errors import ConfigError, MissingDependencyError
 from dsar.raster.conventions import ALPHA_MAX, NEAR
+from dsar.raster.reference import rasterize_reference
 from dsar.types import Camera, Contributors, Gaussians, RenderOutput
 
 
@@ -31,6 +32,8 @@ def rasterize_cuda(
         ConfigError: there is no GPU.
         MissingDependencyError: gsplat is not installed or does not import.
     """
+    if not len(gaussians):
+        return rasterize_reference(gaussians, camera, background, dilation, antialiased, outputs)
     gsplat = _load_gsplat()
     sound = _hide_unsound(gaussians)
     image, alpha, meta = gsplat.rasterization(

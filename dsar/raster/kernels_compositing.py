@@ -58,7 +58,7 @@ _BACKWARD = np.uint64(9 * LANES)
 _MEDIAN, _COUNT = (np.uint64(plane * LANES) for plane in (3, 4))
 _SURVEY, _COLLECT = np.uint64(5 * LANES), np.uint64(3 * LANES)
 
-_LOG_ALPHA_MIN = np.float32(math.log2(ALPHA_MIN))
+_LOG_ALPHA_MIN, _LOG_ALPHA_MAX = np.float32(math.log2(ALPHA_MIN)), np.float32(math.log2(ALPHA_MAX))
 _ALPHA_MAX, _T_MIN = np.float32(ALPHA_MAX), np.float32(TRANSMITTANCE_MIN)
 _ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 
@@ -86,11 +86,10 @@ def _pixel(x, y, stride):
 @inlined
 def _open_tile(state, stride, width, height):
     """Start pixels inside the image, which ends at `width`, `height`, as transparent, others as finished."""
+    width, height = np.float32(width), np.float32(height)
     for block in range(np.uint64(BLOCKS)):
         start = block * stride
-        inside = (load(state, start + _X) < np.float32(width)) & (
-            load(state, start + _Y) < np.float32(height)
-        )
+        inside = (load(state, start + _X) < width) & (load(state, start + _Y) < height)
         store(state, start, choose(inside, spread(_ONE), spread(-_ONE)))
 
 
@@ -128,7 +127,7 @@ def _place(records, i, left, top):
 
 @inlined
 def _blend(state, start, e1_origin, stretch, shear, e2_origin, height, log_opacity):
-    """Pass one splat over one block; return e1, e2, alpha, its weight, and the transmittance before it."""
+    """Pass one splat over one block; return e1, e2, log2 alpha, weight and the transmittance before it."""
     e1 = e1_origin - stretch * load(state, start + _X) + shear * load(state, start + _Y)
     e2 = e2_origin - height * load(state, start + _Y)
     log_alpha = log_opacity - e1 * e1 - e2 * e2
@@ -138,7 +137,7 @@ def _blend(state, start, e1_origin, stretch, shear, e2_origin, height, log_opaci
     after = before - weight
     running = after > _T_MIN
     store(state, start + _T, choose(running, after, negated_size(before)))
-    return e1, e2, alpha, choose(running, weight, spread(_ZERO)), before
+    return e1, e2, log_alpha, choose(running, weight, spread(_ZERO)), before
 
 
 @inlined
@@ -195,9 +194,8 @@ def composite_part(part, parts, records, tile_starts, pairs, tiles_x, background
                 if live == np.uint32(0):
                     break
             _fetch_ahead(flat, pairs, place)
-            _blend_splat(
-                state, np.uint32(pairs[place, 1]) & live, records, np.uint64(pairs[place, 0]), left, top
-            )
+            blocks, i = np.uint32(pairs[place, 1]) & live, np.uint64(pairs[place, 0])
+            _blend_splat(state, blocks, records, i, left, top)
         _close_tile(state, left, top, background, color, alpha, depth)
 
 
@@ -227,7 +225,7 @@ def _blend_splat_backward(state, blocks, records, i, left, top, out):
     while blocks != np.uint32(0):
         start = lowest_bit(blocks) * _BACKWARD
         blocks &= blocks - np.uint32(1)
-        e1, e2, alpha, weight, before = _blend(state, start, *splat)
+        e1, e2, log_alpha, weight, before = _blend(state, start, *splat)
         q = red * load(state, start + _V_RED) + green * load(state, start + _V_GREEN)
         q += blue * load(state, start + _V_BLUE)
         q += z * load(state, start + _V_DEPTH) - load(state, start + _LEVEL)
@@ -238,7 +236,7 @@ def _blend_splat_backward(state, blocks, records, i, left, top, out):
         v_blue += weight * load(state, start + _V_BLUE)
         v_z += weight * load(state, start + _V_DEPTH)
         # v = -alpha dL/dalpha; where alpha is clamped it does not move with the splat's shape.
-        v = choose(alpha < _ALPHA_MAX, weight * (rest / (before - weight) - q), zero)
+        v = choose(log_alpha < _LOG_ALPHA_MAX, weight * (rest / (before - weight) - q), zero)
         v1, v2 = v * e1, v * e2
         s += v
         s1 += v1

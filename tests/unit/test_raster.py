@@ -15,7 +15,25 @@ from dsar.raster import _check_outputs, cpu, rasterize, reduced_dilation
 from dsar.types import Camera, Gaussians
 
 FIELDS = ("means", "rotations", "scales", "opacities", "harmonics")
-BACKENDS = ("reference", "cpu")
+CUDA = pytest.param("cuda", marks=pytest.mark.gpu)
+FAST = ("cpu", CUDA)
+BACKENDS = ("reference", *FAST)
+
+
+def on(device, record):
+    """Return a record of tensors with all of them on a device."""
+    if dataclasses.is_dataclass(record):
+        fields = {field.name: on(device, getattr(record, field.name)) for field in dataclasses.fields(record)}
+        return dataclasses.replace(record, **fields)
+    return record.to(device) if isinstance(record, Tensor) else record
+
+
+def draw(gaussians, camera, backend, background=None, **options):
+    """Rasterise where a backend wants its tensors; return the images in main memory."""
+    device = "cuda" if backend == "cuda" else "cpu"
+    background = on(device, background)
+    output = rasterize(on(device, gaussians), camera, background=background, backend=backend, **options)
+    return on("cpu", output)
 
 
 def make_camera(width=53, height=37, focal=60.0, off_center=(4.3, -2.7)):
@@ -90,7 +108,7 @@ def render_with_gradients(gaussians, camera, backend, dtype, **options):
     """Return the images and the gradients of a fixed random weighting of all of them."""
     leaves = gaussians.map(lambda values: values.detach().to(dtype).clone().requires_grad_())
     background = torch.tensor([0.2, 0.5, 0.9], dtype=dtype, requires_grad=True)
-    output = rasterize(leaves, camera, background=background, backend=backend, **options)
+    output = draw(leaves, camera, backend, background, **options)
     images = (output.color, output.alpha, output.depth)
     generator = torch.Generator().manual_seed(1)
     weights = [torch.randn(i.shape, generator=generator, dtype=torch.float64).to(dtype) for i in images]
@@ -128,23 +146,13 @@ SCENES = {
 }
 
 
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("backend", FAST)
 @pytest.mark.parametrize("scene", SCENES)
-def test_fast_backend_equals_reference(scene):
-    slow, slow_gradients = render_with_gradients(SCENES[scene], make_camera(), "reference", torch.float64)
-    fast, fast_gradients = render_with_gradients(SCENES[scene], make_camera(), "cpu", torch.float32)
-    for name, image in slow.items():
-        assert_same_image(fast[name], image, name)
-    for name, gradient in slow_gradients.items():
-        assert (fast_gradients[name] - gradient).norm() <= 1e-3 * gradient.norm() + 1e-5, name
-
-
-@pytest.mark.parametrize("scene", SCENES)
-def test_antialiased_fast_backend_equals_reference(scene):
-    slow, slow_gradients = render_with_gradients(
-        SCENES[scene], make_camera(), "reference", torch.float64, antialiased=True
-    )
-    fast, fast_gradients = render_with_gradients(
-        SCENES[scene], make_camera(), "cpu", torch.float32, antialiased=True
+def test_fast_backend_equals_reference(scene, backend, antialiased):
+    (slow, slow_gradients), (fast, fast_gradients) = (
+        render_with_gradients(SCENES[scene], make_camera(), which, dtype, antialiased=antialiased)
+        for which, dtype in (("reference", torch.float64), (backend, torch.float32))
     )
     for name, image in slow.items():
         assert_same_image(fast[name], image, name)
@@ -152,12 +160,13 @@ def test_antialiased_fast_backend_equals_reference(scene):
         assert (fast_gradients[name] - gradient).norm() <= 1e-3 * gradient.norm() + 1e-5, name
 
 
+@pytest.mark.parametrize("backend", FAST)
 @pytest.mark.parametrize("size", [(1, 1), (3, 70), (64, 48), (33, 17)])
-def test_any_image_size_works(size):
+def test_any_image_size_works(size, backend):
     camera = make_camera(*size, off_center=(0.0, 0.0))
     gaussians = make_gaussians(200)
     slow, slow_gradients = render_with_gradients(gaussians, camera, "reference", torch.float64)
-    fast, fast_gradients = render_with_gradients(gaussians, camera, "cpu", torch.float32)
+    fast, fast_gradients = render_with_gradients(gaussians, camera, backend, torch.float32)
     assert fast["color"].shape == (size[1], size[0], 3)
     assert_same_image(fast["color"], slow["color"], "color")
     assert (fast_gradients["means"] - slow_gradients["means"]).norm() <= 1e-3 * slow_gradients["means"].norm()
@@ -189,7 +198,7 @@ def test_reference_gradients_equal_finite_differences(antialiased):
 def test_isotropic_gaussian_has_the_closed_form_image(backend):
     camera = make_camera(off_center=(0.0, 0.0))
     gaussians = one_gaussian(harmonics=(torch.tensor([[[0.9, 0.4, 0.1]]]) - 0.5) / C0)
-    output = rasterize(gaussians, camera, backend=backend)
+    output = draw(gaussians, camera, backend)
     y, x = torch.meshgrid(torch.arange(37) + 0.5, torch.arange(53) + 0.5, indexing="ij")
     # sigma of 0.1 m at 2 m through focal lengths 60 and 66, plus the dilation of 0.3 pixels².
     exponent = (x - 26.5) ** 2 / (3.0**2 + 0.3) + (y - 18.5) ** 2 / (3.3**2 + 0.3)
@@ -204,7 +213,7 @@ def test_isotropic_gaussian_has_the_closed_form_image(backend):
 def test_gaussians_at_one_depth_show_that_depth(backend):
     gaussians = make_gaussians(200).map(torch.Tensor.float)
     gaussians.means[:, 2] = 1.25
-    output = rasterize(gaussians, make_camera(), backend=backend)
+    output = draw(gaussians, make_camera(), backend)
     hit = output.alpha > 0
     assert 0.1 < hit.float().mean() < 1
     assert torch.allclose(output.depth[hit], torch.tensor(1.25), atol=1e-4)
@@ -214,8 +223,8 @@ def test_gaussians_at_one_depth_show_that_depth(backend):
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_background_shows_through_what_transmittance_is_left(backend):
     gaussians, background = make_gaussians(100).map(torch.Tensor.float), torch.tensor([0.1, 0.5, 0.9])
-    bare = rasterize(gaussians, make_camera(), backend=backend)
-    over = rasterize(gaussians, make_camera(), background=background, backend=backend)
+    bare = draw(gaussians, make_camera(), backend)
+    over = draw(gaussians, make_camera(), backend, background)
     expected = bare.color + (1 - bare.alpha)[..., None] * background
     assert torch.allclose(over.color, expected, atol=1e-6)
     assert torch.equal(over.alpha, bare.alpha)
@@ -235,7 +244,7 @@ def test_what_cannot_be_drawn_leaves_background_and_zero_gradients(backend, name
 def test_what_is_left_out_is_counted(backend):
     broken = concatenate(*broken_gaussians().values())
     good = make_gaussians(50, spread=0.2).map(torch.Tensor.float)
-    assert rasterize(concatenate(good, broken), make_camera(), backend=backend).culled == len(broken)
+    assert draw(concatenate(good, broken), make_camera(), backend).culled == len(broken)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -245,10 +254,10 @@ def test_distant_splats_keep_their_light_when_antialiased(backend):
     gaussian = one_gaussian(scales=torch.full((1, 3), 0.01))
     # sigma of 0.3 and 0.33 pixels; the light of a splat is 2 pi opacity sigma_x sigma_y.
     light = 2 * math.pi * 0.8 * 0.3 * 0.33
-    smooth = rasterize(gaussian, camera, backend=backend, antialiased=True, dilation=0.5).alpha.sum()
+    smooth = draw(gaussian, camera, backend, antialiased=True, dilation=0.5).alpha.sum()
     # The rim below 1/255 is lost.
     assert 0.95 < smooth / light < 1
-    assert rasterize(gaussian, camera, backend=backend, dilation=0.5).alpha.sum() > 5 * light
+    assert draw(gaussian, camera, backend, dilation=0.5).alpha.sum() > 5 * light
 
 
 EXTRAS = ("median_depth", "contributors")
@@ -258,7 +267,7 @@ EXTRAS = ("median_depth", "contributors")
 @pytest.mark.parametrize("scene", ["random", "dense", "saturated", "with broken ones", "empty"])
 def test_contributors_rebuild_the_image(backend, scene):
     gaussians = SCENES[scene].map(Tensor.float)
-    output = rasterize(gaussians, make_camera(), backend=backend, outputs=EXTRAS)
+    output = draw(gaussians, make_camera(), backend, outputs=EXTRAS)
     counts, ids, weights = (getattr(output.contributors, name) for name in ("counts", "ids", "weights"))
     pixels = torch.arange(37 * 53).repeat_interleave(counts.flatten())
     alpha = torch.zeros(37 * 53).index_add(0, pixels, weights)
@@ -271,11 +280,12 @@ def test_contributors_rebuild_the_image(backend, scene):
     assert (gaussians.means[ids, 2].diff()[same_pixel] >= 0).all()
 
 
+@pytest.mark.parametrize("backend", FAST)
 @pytest.mark.parametrize("scene", ["random", "dense", "saturated", "empty"])
-def test_extra_outputs_equal_the_reference(scene):
+def test_extra_outputs_equal_the_reference(scene, backend):
     slow, fast = (
-        rasterize(SCENES[scene].map(Tensor.float), make_camera(), backend=backend, outputs=EXTRAS)
-        for backend in BACKENDS
+        draw(SCENES[scene].map(Tensor.float), make_camera(), which, outputs=EXTRAS)
+        for which in ("reference", backend)
     )
     # A fragment right at a cut-off may fall on either side of it.
     assert (fast.contributors.counts != slow.contributors.counts).float().mean() < 0.01
@@ -303,12 +313,12 @@ def test_median_depth_is_where_half_of_the_light_is_gone(backend):
         for z in (3.0, 2.0, 1.0)
     ]
     camera = make_camera(off_center=(0.0, 0.0))
-    output = rasterize(concatenate(*sheets), camera, backend=backend, outputs=["median_depth"])
+    output = draw(concatenate(*sheets), camera, backend, outputs=["median_depth"])
     assert (output.median_depth == 2.0).all()
     assert output.contributors is None
-    faint = rasterize(sheets[0], camera, backend=backend, outputs=["median_depth"])
+    faint = draw(sheets[0], camera, backend, outputs=["median_depth"])
     assert (faint.median_depth == 3.0).all()
-    assert rasterize(sheets[0], camera, backend=backend).median_depth is None
+    assert draw(sheets[0], camera, backend).median_depth is None
 
 
 def test_opaque_wall_hides_what_is_behind_it_exactly():
@@ -329,14 +339,15 @@ def test_images_and_gradients_are_bitwise_equal_for_any_number_of_threads(monkey
         assert all(torch.equal(gradient, runs[0][1][name]) for name, gradient in gradients.items())
 
 
-def test_gradients_of_one_output_do_not_need_the_others():
+@pytest.mark.parametrize("backend", FAST)
+def test_gradients_of_one_output_do_not_need_the_others(backend):
     gaussians = make_gaussians(50).map(torch.Tensor.float)
     for name in ("color", "alpha", "depth"):
         slow, fast = (
             torch.autograd.grad(
-                getattr(rasterize(leaves, make_camera(), backend=backend), name).square().sum(), leaves.means
+                getattr(draw(leaves, make_camera(), which), name).square().sum(), leaves.means
             )[0]
-            for backend in BACKENDS
+            for which in ("reference", backend)
             for leaves in [gaussians.map(lambda values: values.clone().requires_grad_())]
         )
         assert (fast - slow).norm() <= 1e-3 * slow.norm(), name
@@ -392,13 +403,13 @@ def test_a_small_image_equals_block_averages_of_the_large_one(backend):
     """Else Gaussians that were fitted to small images come out too thin for large ones."""
     camera = make_camera(96, 64, 120.0)
     gaussians = make_gaussians(30, size=0.03, opacity=(0.2, 0.6))
-    if backend == "cpu":
+    if backend != "reference":
         gaussians = gaussians.map(Tensor.float)
-    large = rasterize(gaussians, camera, backend=backend).alpha
+    large = draw(gaussians, camera, backend).alpha
     averages = torch.nn.functional.avg_pool2d(large[None, None], 2)[0, 0]
     small = camera.resized(48, 32)
-    matched = rasterize(gaussians, small, backend=backend, dilation=reduced_dilation(2)).alpha
-    usual = rasterize(gaussians, small, backend=backend).alpha
+    matched = draw(gaussians, small, backend, dilation=reduced_dilation(2)).alpha
+    usual = draw(gaussians, small, backend).alpha
     # What is left: the peak of a splat as thin as a pixel, which averaging lowers and dilation does not.
     assert (matched - averages).abs().max() < 0.1
     assert (matched - averages).abs().mean() < 0.4 * (usual - averages).abs().mean()
