@@ -40,6 +40,10 @@ class ExportError(DsarError, ValueError):
     """Something cannot be written as asked."""
 
 
+class RasterError(DsarError, ValueError):
+    """Gaussians cannot be drawn."""
+
+
 class TrainingError(DsarError, ArithmeticError):
     """Training met a value that is not finite."""
 

@@ -147,7 +147,7 @@ class RenderOutput:
     depth: Float[Tensor, "h w"]
     """Expected camera-space z in metres, sum(w z) / sum(w); 0 where nothing was hit."""
     culled: Int[Tensor, ""]
-    """How many Gaussians were left out: not valid, too near, too faint, or outside the image."""
+    """How many Gaussians were left out: not valid, too near, too faint, or without a pixel in the image."""
     median_depth: Float[Tensor, "h w"] | None = None
     """On request: z of the Gaussian with which transmittance falls to a half, else of the last one, metres; 0
     where nothing was hit. No gradient."""

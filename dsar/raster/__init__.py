@@ -1,5 +1,6 @@
 """Gaussians to images: one function, several backends with the same meaning."""
 
+import math
 from collections.abc import Collection
 from typing import Literal, get_args
 
@@ -50,12 +51,15 @@ def rasterize(
         The image, differentiable by all Gaussian fields and `background`.
 
     Raises:
-        ConfigError: the tensors do not fit the backend, or the number of harmonics is none of 1, 4, 9, 16.
-        CaptureError: the camera has skew, no positive focal length or no pixels.
+        ConfigError: the tensors do not fit each other or the backend, or a setting is not usable.
+        CaptureError: the camera has skew, no positive focal length, no pixels, or values that are not finite.
+        RasterError: Gaussians are so large that their list of tiles would not fit into memory.
     """
     _check_camera(camera)
     _check_tensors(gaussians, background)
     _check_outputs(outputs)
+    if not 0 < dilation < math.inf:
+        raise ConfigError(f"rasterize: dilation must be positive and finite (pixels²), found {dilation}")
     chosen = _choose_backend(backend, gaussians.means, camera)
     # Imported where they are wanted: kernels take a while to load, and reference users need none.
     if chosen == "cpu":
@@ -104,6 +108,8 @@ def _check_camera(camera: Camera) -> None:
             f"camera {camera.name!r}: K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0, found "
             f"{camera.K.tolist()}; undistort and rectify the images first"
         )
+    if not (camera.K.isfinite().all() and camera.T_camera_world.isfinite().all()):
+        raise CaptureError(f"camera {camera.name!r}: K or T_camera_world holds values that are not finite")
     if camera.width < 1 or camera.height < 1:
         raise CaptureError(f"camera {camera.name!r}: its image has {camera.width} x {camera.height} pixels")
 
@@ -119,21 +125,22 @@ def _check_outputs(outputs: Collection[str]) -> None:
 
 def _check_tensors(gaussians: Gaussians, background: Tensor | None) -> None:
     """Refuse tensors that do not belong together."""
-    count = gaussians.harmonics.shape[1]
+    n, count = len(gaussians), gaussians.harmonics.shape[1]
     if count not in (1, 4, 9, 16):
         raise ConfigError(
             f"rasterize: harmonics come in 1, 4, 9 or 16 coefficients (degree 0-3), not {count}"
         )
-    means = gaussians.means
-    others = (
-        gaussians.rotations,
-        gaussians.scales,
-        gaussians.opacities,
-        gaussians.harmonics,
-        background,
-    )
-    for tensor in others:
-        if tensor is not None and (tensor.dtype != means.dtype or tensor.device != means.device):
+    shapes = {
+        "means": (n, 3), "rotations": (n, 4), "scales": (n, 3), "opacities": (n,), "harmonics": (n, count, 3),
+        "background": (3,),
+    }  # fmt: skip
+    means, tensors = gaussians.means, {**vars(gaussians), "background": background}
+    for name, tensor in tensors.items():
+        if tensor is None:
+            continue
+        if tensor.shape != shapes[name]:
+            raise ConfigError(f"rasterize: {name} must be {shapes[name]}, found {tuple(tensor.shape)}")
+        if tensor.dtype != means.dtype or tensor.device != means.device:
             raise ConfigError(
                 f"rasterize: tensors differ: {means.dtype} on {means.device} and {tensor.dtype} on "
                 f"{tensor.device}; bring all to one dtype and device"

@@ -1,7 +1,6 @@
 """The constants that decide which Gaussian reaches which pixel: those of gsplat 1.5.3.
 
 Every backend uses exactly these, so that an image does not depend on the machine that made it.
-Compiled kernels bake them in: after a change, delete the kernel cache (`__pycache__/*.nb*`).
 """
 
 EPS_2D = 0.3

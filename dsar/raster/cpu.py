@@ -18,6 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from dsar.errors import RasterError
 from dsar.raster.conventions import EPS_2D
 from dsar.raster.kernels_binning import (
     FIRST_ROWS,
@@ -29,18 +30,19 @@ from dsar.raster.kernels_binning import (
 )
 from dsar.raster.kernels_compositing import (
     SUMS_SIZE,
-    collect_part,
     composite_backward_part,
     composite_part,
     survey_part,
 )
-from dsar.raster.kernels_projection import RECORD_SIZE, project_backward_part, project_part
+from dsar.raster.kernels_projection import project_backward_part, project_part
 from dsar.raster.kernels_shading import shade_backward_part, shade_part
 from dsar.raster.parallel import part_count, run_parts
-from dsar.raster.tiles import TILE
+from dsar.raster.tiles import RECORD_SIZE, TILE
 from dsar.types import Camera, Contributors, Gaussians, RenderOutput
 
 _log = logging.getLogger(__name__)
+_MOST_PAIRS = 2**28
+"""Places are 32-bit, and a backward pass keeps 52 bytes a pair: this many would take 14 GB."""
 _NO_IMAGE = np.empty((0, 0), np.float32)
 _NO_COLOR = np.empty((0, 0, 3), np.float32)
 _BLACK = np.zeros(3, np.float32)
@@ -154,6 +156,12 @@ def _bin(
     cursors = np.empty((part_count(), tiles_x * tiles_y), np.int32)
     tiles = np.zeros(len(bounds), np.int32)
     run_parts(count_pairs_part, order, records, bounds, tiles_x, cursors, tiles)
+    total = int(tiles.sum(dtype=np.int64))
+    if total > _MOST_PAIRS:
+        raise RasterError(
+            f"rasterize: {len(order)} Gaussians cover {total} tiles of {TILE} x {TILE} pixels in all, more "
+            f"than the {_MOST_PAIRS} that can be listed; are scales in metres, and has training diverged?"
+        )
     tile_starts, splat_starts = place_pairs(cursors, tiles)
     pairs, places = np.empty((tile_starts[-1], 2), np.int32), np.empty(tile_starts[-1], np.int32)
     run_parts(deal_pairs_part, order, records, bounds, tiles_x, FIRST_ROWS, cursors, splat_starts,
@@ -168,16 +176,22 @@ def _survey(
     if not settings.outputs:
         return None, None, None, None
     width, height = settings.camera.width, settings.camera.height
-    medians, counts = torch.empty(height, width), torch.empty(height, width, dtype=torch.int32)
-    run_parts(survey_part, records, tile_starts, pairs, tiles_x, medians.numpy(), counts.numpy())
+    medians, counts = torch.empty(height, width), torch.empty(height, width, dtype=torch.int64)
+    ids, weights = torch.empty(0, dtype=torch.int64), torch.empty(0)
+    starts = np.zeros(height * width, np.int64)
+
+    def survey() -> None:
+        run_parts(survey_part, records, tile_starts, pairs, tiles_x, starts, medians.numpy(), counts.numpy(),
+                  ids.numpy(), weights.numpy())  # fmt: skip
+
+    survey()
     wanted = medians if "median_depth" in settings.outputs else None
     if "contributors" not in settings.outputs:
         return wanted, None, None, None
     ends = counts.flatten().cumsum(0)
-    ids, weights = torch.empty(int(ends[-1]), dtype=torch.int64), torch.empty(int(ends[-1]))
     starts = (ends - counts.flatten()).numpy()
-    run_parts(collect_part, records, tile_starts, pairs, tiles_x, width, height, starts, ids.numpy(),
-              weights.numpy())  # fmt: skip
+    ids, weights = torch.empty(int(ends[-1]), dtype=torch.int64), torch.empty(int(ends[-1]))
+    survey()
     return wanted, counts, ids, weights
 
 
@@ -209,7 +223,7 @@ def _as_array(tensor: Tensor | None, missing: np.ndarray = _BLACK) -> np.ndarray
 
 def _pack_camera(settings: _Settings) -> tuple[np.ndarray, np.ndarray]:
     """Return the kernels' camera (18 numbers, see kernels_projection) and its centre in the world."""
-    transform, K = settings.camera.T_camera_world.detach().numpy(), settings.camera.K.detach().numpy()
+    transform, K = (t.detach().cpu().numpy() for t in (settings.camera.T_camera_world, settings.camera.K))
     rotation, translation = transform[:3, :3], transform[:3, 3]
     view = np.empty(18, np.float32)
     view[:9], view[9:12] = rotation.ravel(), translation
@@ -220,15 +234,17 @@ def _pack_camera(settings: _Settings) -> tuple[np.ndarray, np.ndarray]:
 
 @cache
 def _load_kernels() -> None:
-    """Load or compile the kernels by rendering one Gaussian, so that the wait can be announced."""
-    _log.info("Loading the rasteriser; its first use on a machine compiles it (about 20 s)")
+    """Load or compile the kernels by rendering, so that the wait can be announced."""
+    _log.info("Loading the rasteriser; its first use on a machine compiles it (about 30 s)")
     start = time.perf_counter()
     camera = Camera(torch.eye(3), torch.eye(4), 8, 8, "one")
     # Whatever mode the first caller is in, the backward kernels are wanted too.
     with torch.inference_mode(False), torch.enable_grad():
-        one = Gaussians(
-            torch.tensor([[0.0, 0.0, 1.0]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]]), torch.ones(1, 3),
-            torch.full((1,), 0.5), torch.zeros(1, 1, 3),
+        # Two: the bounds of a single one look like an array without gaps, which has kernels of its own.
+        two = Gaussians(
+            torch.tensor([[0.0, 0.0, 1.0]] * 2), torch.tensor([[1.0, 0.0, 0.0, 0.0]] * 2), torch.ones(2, 3),
+            torch.full((2,), 0.5), torch.zeros(2, 1, 3),
         ).map(Tensor.requires_grad_)  # fmt: skip
-        _apply(one, None, _Settings(camera)).color.sum().backward()
+        settings = _Settings(camera, outputs=("median_depth", "contributors"))
+        _apply(two, None, settings).color.sum().backward()
     _log.info("Rasteriser ready after %.1f s", time.perf_counter() - start)

@@ -1,7 +1,9 @@
 """The fast backend on NVIDIA GPUs: gsplat (Apache-2.0) behind the same signature, float32.
 
 gsplat is imported at the first image, and compiles its kernels at the first ever (minutes, with nvcc). Its
-constants are those of dsar.raster.conventions; its version is pinned, because 1.6 changed some of them.
+constants are those of dsar.raster.conventions; its version is pinned, because 1.6 changed some of them. It
+adds up gradients in whatever order its threads arrive, so they are not the same to the bit from run to run.
+It counts as drawn what only its bounding box brings into the image.
 """
 
 from collections.abc import Collection
@@ -29,7 +31,7 @@ def rasterize_cuda(
     """Rasterise with gsplat: `dsar.raster.rasterize` without its checks, for float32 on a GPU.
 
     Raises:
-        ConfigError: there is no GPU.
+        ConfigError: there is no GPU, or no CUDA toolkit for gsplat's first use.
         MissingDependencyError: gsplat is not installed or does not import.
     """
     if not len(gaussians):
@@ -82,8 +84,14 @@ def _load_gsplat() -> Any:
         )
     try:
         import gsplat  # pyright: ignore[reportMissingImports]  # not where CI runs
+        from gsplat.cuda._backend import _C  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise MissingDependencyError("the cuda backend of rasterize", "gsplat", "gpu") from error
+    if _C is None:
+        raise ConfigError(
+            "rasterize: gsplat found no CUDA toolkit to compile its kernels with; put nvcc on PATH or set "
+            "CUDA_HOME"
+        )
     return gsplat
 
 
@@ -93,9 +101,10 @@ def _hide_unsound(gaussians: Gaussians) -> Gaussians:
     gsplat would blend what is not finite or has no size; were they taken out, the GPU would have to wait for
     their number.
     """
-    sound = (gaussians.scales > 0).all(-1) & (gaussians.rotations.norm(dim=-1) > 0)
+    norms = gaussians.rotations.norm(dim=-1)
+    sound = (gaussians.scales > 0).all(-1) & (norms > 0) & norms.isfinite()
     for values in vars(gaussians).values():
-        sound &= values.detach().isfinite().view(len(values), -1).all(-1)
+        sound &= values.detach().isfinite().reshape(len(values), -1).all(-1)
 
     def replace(values: Tensor, substitute: float) -> Tensor:
         return torch.where(sound.view(-1, *[1] * (values.ndim - 1)), values, substitute)

@@ -2,6 +2,7 @@
 
 import inspect
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from numba import njit
@@ -12,6 +13,11 @@ _OPTIONS = {
     # A division that may raise would stop a loop from vectorising.
     "error_model": "numpy",
 }
+# Time and size of every file whose constants and functions end up inside kernels.
+_SHARED = tuple(
+    (path.name, path.stat().st_mtime, path.stat().st_size)
+    for path in sorted(Path(__file__).parent.glob("*.py"))
+)
 
 
 def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -23,6 +29,9 @@ def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a function that Python calls: kept on disk once compiled, and able to run beside other threads.
 
-    Numba notices edits of the kernel's own file only, so a kernel calls nothing compiled from another file.
+    Numba itself notices edits of the kernel's own file only; what kernels share is watched here.
     """
-    return njit(cache=True, nogil=True, **_OPTIONS)(inspect.unwrap(function))
+    dispatcher = njit(cache=True, nogil=True, **_OPTIONS)(inspect.unwrap(function))
+    stored = dispatcher._cache._cache_file  # pyright: ignore[reportAttributeAccessIssue]  # no public way
+    stored._source_stamp = stored._source_stamp, _SHARED
+    return dispatcher

@@ -16,7 +16,7 @@ import numpy as np
 from dsar.raster.conventions import ALPHA_MIN
 from dsar.raster.jit import inlined, kernel
 from dsar.raster.simd import LANES, bits_of, larger, load, prefetch, smaller, spread, square_root
-from dsar.raster.tiles import BLOCK_HEIGHT, BLOCK_WIDTH, COLUMNS, STRIPS, TILE, TILE_BITS
+from dsar.raster.tiles import BLOCK_HEIGHT, BLOCK_WIDTH, COLUMNS, RECORD_SIZE, STRIPS, TILE, TILE_BITS
 
 FIRST_ROWS = np.array([BLOCK_HEIGHT * strip + 0.5 for strip in range(LANES)], np.float32)
 """Centre of each strip's first pixel row, from the tile's top; lanes beyond the last strip are not used."""
@@ -62,7 +62,7 @@ def sort_by_depth(records, bounds):
 def _fetch_ahead(records, order, k):
     """Have the record of a splat that is due soon brought into the cache."""
     if k + _AHEAD < len(order):
-        prefetch(records, np.uint64(order[k + _AHEAD]) * np.uint64(16))
+        prefetch(records, np.uint64(order[k + _AHEAD]) * np.uint64(RECORD_SIZE))
 
 
 @inlined

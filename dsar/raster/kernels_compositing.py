@@ -35,7 +35,7 @@ from dsar.raster.simd import (
     store,
     total,
 )
-from dsar.raster.tiles import BLOCK_HEIGHT, BLOCK_WIDTH, BLOCKS, STRIPS, TILE
+from dsar.raster.tiles import BLOCK_HEIGHT, BLOCK_WIDTH, BLOCKS, RECORD_SIZE, STRIPS, TILE
 
 SUMS_SIZE = 10
 """With v = dL/d(e1² + e2²): sums of v, v e1, v e2, v e1², v e1 e2, v e2²; then dL/d(red, green, blue, z)."""
@@ -54,9 +54,9 @@ _V_RED, _V_GREEN, _V_BLUE, _V_DEPTH, _LEVEL, _REST = (
     np.uint64(plane * LANES) for plane in (3, 4, 5, 6, 7, 8)
 )
 _BACKWARD = np.uint64(9 * LANES)
-# Survey: depth at half transmittance, and how many splats were blended. Collecting needs no plane of its own.
+# Survey: depth at half transmittance, and how many splats were blended.
 _MEDIAN, _COUNT = (np.uint64(plane * LANES) for plane in (3, 4))
-_SURVEY, _COLLECT = np.uint64(5 * LANES), np.uint64(3 * LANES)
+_SURVEY = np.uint64(5 * LANES)
 
 _LOG_ALPHA_MIN, _LOG_ALPHA_MAX = np.float32(math.log2(ALPHA_MIN)), np.float32(math.log2(ALPHA_MAX))
 _ALPHA_MAX, _T_MIN = np.float32(ALPHA_MAX), np.float32(TRANSMITTANCE_MIN)
@@ -108,11 +108,11 @@ def _fetch_ahead(records, pairs, place):
     """Have the record of a splat that is due soon brought into the cache."""
     due = place + np.uint64(_AHEAD)
     if due < np.uint64(len(pairs)):
-        prefetch(records, np.uint64(pairs[due, 0]) * np.uint64(16))
+        prefetch(records, np.uint64(pairs[due, 0]) * np.uint64(RECORD_SIZE))
 
 
 @inlined
-def _place(records, i, left, top):
+def _at_corner(records, i, left, top):
     """Return what `_blend` needs of a splat, with the tile's corner as origin."""
     x, y = records[i, 0] - np.float32(left), records[i, 1] - np.float32(top)
     return (
@@ -202,7 +202,7 @@ def composite_part(part, parts, records, tile_starts, pairs, tiles_x, background
 @inlined
 def _blend_splat(state, blocks, records, i, left, top):
     """Blend one splat over a set of blocks."""
-    splat = _place(records, i, left, top)
+    splat = _at_corner(records, i, left, top)
     red, green, blue, z = records[i, 6], records[i, 7], records[i, 8], records[i, 9]
     while blocks != np.uint32(0):
         start = lowest_bit(blocks) * _FORWARD
@@ -217,7 +217,7 @@ def _blend_splat(state, blocks, records, i, left, top):
 @inlined
 def _blend_splat_backward(state, blocks, records, i, left, top, out):
     """Blend one splat again, and write its gradient sums over a set of blocks."""
-    splat = _place(records, i, left, top)
+    splat = _at_corner(records, i, left, top)
     red, green, blue, z = records[i, 6], records[i, 7], records[i, 8], records[i, 9]
     zero = spread(_ZERO)
     s, s1, s2, s11, s12, s22 = zero, zero, zero, zero, zero, zero
@@ -254,6 +254,11 @@ def _blend_splat_backward(state, blocks, records, i, left, top, out):
 def _load_gradients(state, left, top, color, alpha, depth, v_color, v_alpha, v_depth):
     """Load the gradients that arrive at a tile, and `rest` before the first splat. Empty arrays mean zero."""
     height, width = alpha.shape
+    if left + TILE > width or top + TILE > height:
+        # Else pixels outside would keep the gradients of another tile.
+        for block in range(np.uint64(BLOCKS)):
+            for plane in (_V_RED, _V_GREEN, _V_BLUE, _V_DEPTH, _LEVEL, _REST):
+                store(state, block * _BACKWARD + plane, spread(_ZERO))
     for y in range(top, min(top + TILE, height)):
         for x in range(left, min(left + TILE, width)):
             pixel = _pixel(x - left, y - top, _BACKWARD)
@@ -300,57 +305,54 @@ def composite_backward_part(
 
 
 @kernel
-def survey_part(part, parts, records, tile_starts, pairs, tiles_x, medians, counts):
-    """Blend every parts-th tile once more, for its median depths and how many splats each pixel has."""
+def survey_part(
+    part, parts, records, tile_starts, pairs, tiles_x, starts, medians, counts, ids, weights
+):  # fmt: skip
+    """Blend every parts-th tile once more, for its median depths and how many splats each pixel has.
+
+    If `ids` is not empty, write each pixel's splats and weights from its start on. One kernel does both,
+    because another might round otherwise, and find another number of splats.
+    """
     height, width = medians.shape
-    state = _new_state(_SURVEY)
+    state, lanes, cursors = (
+        _new_state(_SURVEY),
+        np.empty(LANES, np.float32),
+        np.zeros(BLOCKS * LANES, np.int64),
+    )
+    collecting = len(ids) > 0
     for tile in range(part, len(tile_starts) - 1, parts):
         left, top = tile % tiles_x * TILE, tile // tiles_x * TILE
         _open_tile(state, _SURVEY, width - left, height - top)
         for block in range(np.uint64(BLOCKS)):
             store(state, block * _SURVEY + _MEDIAN, spread(_ZERO))
             store(state, block * _SURVEY + _COUNT, spread(_ZERO))
+        if collecting:
+            for y in range(min(TILE, height - top)):
+                for x in range(min(TILE, width - left)):
+                    cursors[_pixel(x, y, np.uint64(LANES))] = starts[(top + y) * width + left + x]
         for place in range(tile_starts[tile], tile_starts[tile + 1]):
             blocks, i = np.uint32(pairs[place, 1]), np.uint64(pairs[place, 0])
-            splat = _place(records, i, left, top)
+            splat = _at_corner(records, i, left, top)
             while blocks != np.uint32(0):
-                start = lowest_bit(blocks) * _SURVEY
+                block = lowest_bit(blocks)
+                start = block * _SURVEY
                 blocks &= blocks - np.uint32(1)
                 _, _, _, weight, before = _blend(state, start, *splat)
-                median, blended = load(state, start + _MEDIAN), weight > _ZERO
-                is_median = blended & (before > _HALF)
-                store(state, start + _MEDIAN, choose(is_median, spread(records[i, 9]), median))
+                blended = weight > _ZERO
+                median = load(state, start + _MEDIAN)
+                store(state, start + _MEDIAN,
+                      choose(blended & (before > _HALF), spread(records[i, 9]), median))  # fmt: skip
                 _add(state, start + _COUNT, choose(blended, spread(_ONE), spread(_ZERO)))
+                store(lanes, np.uint64(0), weight)
+                hits = bits_of(blended) if collecting else np.uint32(0)
+                while hits != np.uint32(0):
+                    lane = lowest_bit(hits)
+                    hits &= hits - np.uint32(1)
+                    pixel = block * np.uint64(LANES) + lane
+                    ids[cursors[pixel]], weights[cursors[pixel]] = i, lanes[lane]
+                    cursors[pixel] += 1
         for y in range(min(TILE, height - top)):
             for x in range(min(TILE, width - left)):
                 pixel = _pixel(x, y, _SURVEY)
                 medians[top + y, left + x] = state[pixel + _MEDIAN]
-                counts[top + y, left + x] = np.int32(state[pixel + _COUNT])
-
-
-@kernel
-def collect_part(part, parts, records, tile_starts, pairs, tiles_x, width, height, starts, ids, weights):
-    """Blend every parts-th tile once more, and write each pixel's splats and weights from its start on."""
-    state, lanes = _new_state(_COLLECT), np.empty(LANES, np.float32)
-    cursors = np.empty(BLOCKS * LANES, np.int64)
-    for tile in range(part, len(tile_starts) - 1, parts):
-        left, top = tile % tiles_x * TILE, tile // tiles_x * TILE
-        _open_tile(state, _COLLECT, width - left, height - top)
-        for y in range(min(TILE, height - top)):
-            for x in range(min(TILE, width - left)):
-                cursors[_pixel(x, y, np.uint64(LANES))] = starts[(top + y) * width + left + x]
-        for place in range(tile_starts[tile], tile_starts[tile + 1]):
-            blocks, i = np.uint32(pairs[place, 1]), np.uint64(pairs[place, 0])
-            splat = _place(records, i, left, top)
-            while blocks != np.uint32(0):
-                block = lowest_bit(blocks)
-                blocks &= blocks - np.uint32(1)
-                _, _, _, weight, _ = _blend(state, block * _COLLECT, *splat)
-                store(lanes, np.uint64(0), weight)
-                hits = bits_of(weight > _ZERO)
-                while hits != np.uint32(0):
-                    lane = lowest_bit(hits)
-                    hits &= hits - np.uint32(1)
-                    cursor = block * np.uint64(LANES) + lane
-                    ids[cursors[cursor]], weights[cursors[cursor]] = i, lanes[lane]
-                    cursors[cursor] += 1
+                counts[top + y, left + x] = np.int64(state[pixel + _COUNT])

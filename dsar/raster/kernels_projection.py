@@ -35,7 +35,6 @@ from dsar.raster.simd import (
     store,
 )
 
-RECORD_SIZE = 16
 _NEAR = np.float32(NEAR)
 _MARGIN = np.float32(0.5 * FRUSTUM_MARGIN)
 _ALPHA_MIN = np.float32(ALPHA_MIN)
@@ -205,7 +204,7 @@ def _project(scratch, camera, width, height):
     """Replace Gaussians in the scratch planes by their records and bounds."""
     mean, scales, opacity = _planes(scratch, _MEAN), _planes(scratch, _SCALES), _plane(scratch, _OPACITY)
     point = _camera_point(mean, camera)
-    w, x, y, z, _ = _unit_quaternion(scratch)
+    w, x, y, z, inverse = _unit_quaternion(scratch)
     rows = _rotation_rows(w, x, y, z)
     u1, u2, _, _ = _image_axes(point, camera, width, height)
     g1, g2 = _times_matrix(u1, rows), _times_matrix(u2, rows)
@@ -221,9 +220,16 @@ def _project(scratch, camera, width, height):
     x0, x1 = _pixel_range(mean_x, square_root(reach * a), width)
     y0, y1 = _pixel_range(mean_y, square_root(reach * c), height)
     # Comparisons with NaN fail, and so does one with an infinite or NaN sum.
-    finite = mean_x + mean_y + a + c + slim + opacity
+    finite = mean_x + mean_y + point[2] + a + c + slim + opacity
     drawn = (point[2] > _NEAR) & (opacity >= _ALPHA_MIN) & (finite <= _LARGEST) & (finite >= -_LARGEST)
-    drawn = drawn & (smaller(smaller(scales[0], scales[1]), scales[2]) > _ZERO) & (x0 < x1) & (y0 < y1)
+    # A quaternion whose square overflows has no inverse norm.
+    drawn = (
+        drawn
+        & (inverse > _ZERO)
+        & (smaller(smaller(scales[0], scales[1]), scales[2]) > _ZERO)
+        & (x0 < x1)
+        & (y0 < y1)
+    )
     stretch = square_root(_HALF * _LOG2_E / slim)
     _write(scratch, 0, mean_x)
     _write(scratch, 1, mean_y)

@@ -78,7 +78,7 @@ def rasterize_reference(
         median = torch.cat([torch.cat([tile.median_depth for tile in row], 1) for row in rows], 0)
     if "contributors" in outputs:
         contributors = _join([tile for row in rows for tile in row], camera)
-    culled = torch.tensor(len(gaussians) - len(splats.ids))
+    culled = torch.tensor(len(gaussians) - len(splats.ids), device=color.device)
     return RenderOutput(color, alpha[..., 0], depth[..., 0], culled, median, contributors)
 
 
@@ -107,7 +107,8 @@ def _find_drawable(
     """Return which Gaussians are in front, visible, of positive scale, and finite in all they project to."""
     means, covariances, depths, opacities = _project(gaussians, camera, dilation, antialiased)
     drawable = (depths > NEAR) & (opacities >= ALPHA_MIN) & (gaussians.scales > 0).all(-1)
-    drawable &= gaussians.rotations.norm(dim=-1) > 0
+    norms = gaussians.rotations.norm(dim=-1)
+    drawable &= (norms > 0) & norms.isfinite() & depths.isfinite()
     # Harmonics and not colours, whose clamp would make 0 of minus infinity.
     for values in (means, covariances.flatten(1), opacities[:, None], gaussians.harmonics.flatten(1)):
         drawable &= values.isfinite().all(-1)

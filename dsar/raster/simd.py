@@ -72,7 +72,7 @@ def _define(
     """Give an operator its meaning on registers."""
 
     class _Operator(ConcreteTemplate):
-        cases = [signature(result, *types) for types in operands]  # noqa: RUF012  # read by Numba
+        cases = [signature(result, *kinds) for kinds in operands]  # noqa: RUF012  # read by Numba
 
     infer_global(function)(_Operator)  # pyright: ignore[reportOptionalCall]  # Numba's own idiom
     for one in operands:
@@ -108,6 +108,15 @@ def _call(builder: ir.IRBuilder, name: str, result: ir.Type, *arguments: Any) ->
     return builder.call(function, arguments)
 
 
+def _is_flat(array: types.Type) -> bool:
+    """Return whether an argument is a contiguous one-dimensional float32 array; else typing must fail."""
+    return isinstance(array, types.Array) and (array.dtype, array.ndim, array.layout) == (
+        types.float32,
+        1,
+        "C",
+    )
+
+
 def _address(context: Any, builder: ir.IRBuilder, kind: types.Array, array: Any, index: Any) -> Any:
     """Return where element `index` of a one-dimensional contiguous array lies."""
     return builder.gep(context.make_array(kind)(context, builder, array).data, [index])
@@ -121,7 +130,7 @@ def load(typing, array, index):
         place = _address(context, builder, signature.args[0], *arguments)
         return builder.load(builder.bitcast(place, _FLOATS.as_pointer()), align=4)
 
-    return floats(array, types.uintp), emit
+    return (floats(array, types.uintp), emit) if _is_flat(array) else None
 
 
 @_operation
@@ -133,7 +142,7 @@ def store(typing, array, index, values):
         builder.store(arguments[2], builder.bitcast(place, _FLOATS.as_pointer()), align=4)
         return context.get_dummy_value()
 
-    return types.void(array, types.uintp, floats), emit
+    return (types.void(array, types.uintp, floats), emit) if _is_flat(array) else None
 
 
 @_operation
@@ -147,7 +156,7 @@ def prefetch(typing, array, index):
         _call(builder, "llvm.prefetch.p0", ir.VoidType(), place, read, keep, data)
         return context.get_dummy_value()
 
-    return types.void(array, types.uintp), emit
+    return (types.void(array, types.uintp), emit) if _is_flat(array) else None
 
 
 @_operation

@@ -1,11 +1,14 @@
-"""How the image is cut up: tiles, whose lists of splats are sorted, of blocks, which a register holds.
+"""How memory is laid out, for all kernels: the records of splats, and how the image is cut up.
 
-A block is 4 pixels wide and as tall as LANES allows. Bit `column * STRIPS + strip` of a set of blocks stands
-for the block in that column and strip (row of blocks) of the tile.
+The image consists of tiles, which have lists of splats, and these of blocks, which fill a register. A block
+is 4 pixels wide and as tall as LANES allows. Bit `column * STRIPS + strip` of a set of blocks stands for the
+block in that column and strip (row of blocks) of the tile.
 """
 
 from dsar.raster.simd import LANES
 
+RECORD_SIZE = 16
+"""Numbers in a splat's record (see kernels_projection): a cache line."""
 TILE_BITS = 4
 TILE = 1 << TILE_BITS
 """Pixels along a tile's side."""

@@ -8,7 +8,7 @@ import torch
 
 from dsar.errors import ConfigError, MissingDependencyError
 from dsar.raster import cuda, rasterize
-from dsar.raster.reference import _project, rasterize_reference
+from dsar.raster.reference import _project, _radii, rasterize_reference
 from dsar.types import Camera, Gaussians
 
 EXTRAS = ("median_depth", "contributors")
@@ -35,8 +35,12 @@ class StandIn:
         means2d, covariances, depths, effective = _project(gaussians, camera, eps2d, antialiased)
         a, b, d = covariances[:, 0, 0], covariances[:, 0, 1], covariances[:, 1, 1]
         conics = torch.stack([d, -b, a], -1) / (a * d - b * b)[:, None]
-        drawn = torch.zeros(len(means), dtype=torch.bool)
-        drawn[drawing.contributors.ids] = True
+        # Drawn is what a box of whole pixels brings into the image.
+        boxes = _radii(covariances, effective).ceil()
+        size = torch.tensor([width, height])
+        drawn = ((means2d + boxes > 0) & (means2d - boxes < size)).all(-1)
+        drawn &= (depths > near_plane) & (effective >= 1 / 255)
+        self.drawn = int(drawn.sum())
         hidden = torch.where(drawn, 0.0, torch.nan)
         meta = {
             "radii": drawn[:, None].expand(-1, 2)[None].int() * 9,
@@ -85,7 +89,8 @@ def test_adapter_returns_what_the_reference_does(monkeypatch, scene, antialiased
     gaussians, camera = scene
     gaussians = gaussians.map(lambda values: values.requires_grad_())
     background = torch.tensor([0.2, 0.5, 0.9])
-    monkeypatch.setattr(cuda, "_load_gsplat", StandIn)
+    gsplat = StandIn()
+    monkeypatch.setattr(cuda, "_load_gsplat", lambda: gsplat)
     ours = cuda.rasterize_cuda(gaussians, camera, background, 0.3, antialiased, EXTRAS)
     true = rasterize_reference(gaussians, camera, background, 0.3, antialiased, EXTRAS)
     for name in ("color", "alpha", "depth", "median_depth"):
@@ -93,7 +98,8 @@ def test_adapter_returns_what_the_reference_does(monkeypatch, scene, antialiased
     assert torch.equal(ours.contributors.counts, true.contributors.counts)
     assert torch.equal(ours.contributors.ids, true.contributors.ids)
     assert torch.allclose(ours.contributors.weights, true.contributors.weights, atol=1e-5)
-    assert ours.culled == 150 - len(ours.contributors.ids.unique())
+    assert ours.culled == 150 - gsplat.drawn
+    assert 4 <= ours.culled <= true.culled
     ours.color.sum().backward()
     assert all(values.grad.isfinite().all() for values in vars(gaussians).values())
     assert not gaussians.means.grad[3:7].any()
@@ -107,8 +113,15 @@ def test_extras_are_computed_only_on_request(monkeypatch, scene):
     assert cuda.rasterize_cuda(*scene, None, 0.3, False, ("median_depth",)).contributors is None
 
 
-def test_what_is_missing_is_said(monkeypatch, scene):
+@pytest.fixture
+def forgetful():
+    """Have gsplat looked for anew, before and after."""
     cuda._load_gsplat.cache_clear()
+    yield
+    cuda._load_gsplat.cache_clear()
+
+
+def test_what_is_missing_is_said(monkeypatch, scene, forgetful):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(ConfigError, match="needs an NVIDIA GPU"):
         cuda.rasterize_cuda(*scene, None, 0.3, False, ())
@@ -116,10 +129,14 @@ def test_what_is_missing_is_said(monkeypatch, scene):
     monkeypatch.setitem(sys.modules, "gsplat", None)
     with pytest.raises(MissingDependencyError, match=r"dsar-avatar\[gpu\]"):
         cuda.rasterize_cuda(*scene, None, 0.3, False, ())
-    module = types.ModuleType("gsplat")
-    monkeypatch.setitem(sys.modules, "gsplat", module)
-    assert cuda._load_gsplat() is module
-    cuda._load_gsplat.cache_clear()
+    fakes = {name: types.ModuleType(name) for name in ("gsplat", "gsplat.cuda", "gsplat.cuda._backend")}
+    for name, module in fakes.items():
+        monkeypatch.setitem(sys.modules, name, module)
+    fakes["gsplat.cuda._backend"]._C = None
+    with pytest.raises(ConfigError, match="no CUDA toolkit"):
+        cuda._load_gsplat()
+    fakes["gsplat.cuda._backend"]._C = object()
+    assert cuda._load_gsplat() is fakes["gsplat"]
 
 
 @pytest.mark.gpu

@@ -3,13 +3,15 @@
 import dataclasses
 import logging
 import math
+import subprocess
+import sys
 
 import numba
 import pytest
 import torch
 from torch import Tensor
 
-from dsar.errors import CaptureError, ConfigError
+from dsar.errors import CaptureError, ConfigError, RasterError
 from dsar.geometry.harmonics import C0
 from dsar.raster import _check_outputs, cpu, rasterize, reduced_dilation
 from dsar.types import Camera, Gaussians
@@ -123,8 +125,8 @@ def render_with_gradients(gaussians, camera, backend, dtype, **options):
 def assert_same_image(fast, slow, name):
     """Compare images to 1e-4; a fragment right at the 1/255 cut-off may fall on either side of it."""
     error = (fast - slow).detach().abs().flatten()
-    assert (error > 1e-4).float().mean() <= 0.002, name
-    assert name == "depth" or error.max() < 0.01, name
+    assert (~(error <= 1e-4)).float().mean() <= 0.002, name
+    assert name == "depth" or (error < 0.01).all(), name
 
 
 SCENES = {
@@ -289,7 +291,7 @@ def test_extra_outputs_equal_the_reference(scene, backend):
     )
     # A fragment right at a cut-off may fall on either side of it.
     assert (fast.contributors.counts != slow.contributors.counts).float().mean() < 0.01
-    assert ((fast.median_depth - slow.median_depth).abs() > 1e-4).float().mean() < 0.01
+    assert (~((fast.median_depth - slow.median_depth).abs() <= 1e-4)).float().mean() < 0.01
     same = (fast.contributors.counts == slow.contributors.counts).all(1)
     rows = [
         [
@@ -321,6 +323,12 @@ def test_median_depth_is_where_half_of_the_light_is_gone(backend):
     assert draw(sheets[0], camera, backend).median_depth is None
 
 
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_rotation_whose_square_overflows_is_left_out(backend):
+    """Else its inverse norm is 0, and it is drawn as if it were not turned."""
+    assert draw(one_gaussian(rotations=torch.full((1, 4), 1e20)), make_camera(), backend).culled == 1
+
+
 def test_opaque_wall_hides_what_is_behind_it_exactly():
     walls = [one_gaussian(scales=torch.full((1, 3), 5.0), opacities=torch.ones(1)) for _ in range(3)]
     hidden = one_gaussian(means=torch.tensor([[0.0, 0.0, 3.0]]), harmonics=torch.full((1, 1, 3), 5.0))
@@ -329,11 +337,17 @@ def test_opaque_wall_hides_what_is_behind_it_exactly():
     assert torch.equal(with_hidden.color, rasterize(concatenate(*walls), camera).color)
 
 
-def test_images_and_gradients_are_bitwise_equal_for_any_number_of_threads(monkeypatch):
+@pytest.mark.parametrize("scene", ["dense", "saturated", "empty"])
+def test_images_and_gradients_are_bitwise_equal_for_any_number_of_threads(monkeypatch, scene):
     runs = []
     for threads in (1, 2, 5):
         monkeypatch.setattr(numba, "get_num_threads", lambda threads=threads: threads)
-        runs.append(render_with_gradients(SCENES["dense"], make_camera(), "cpu", torch.float32))
+        images, gradients = render_with_gradients(
+            SCENES[scene], make_camera(), "cpu", torch.float32, antialiased=True
+        )
+        extras = draw(SCENES[scene].map(Tensor.float), make_camera(), "cpu", outputs=EXTRAS)
+        images |= {"median": extras.median_depth} | vars(extras.contributors)
+        runs.append((images, gradients))
     for images, gradients in runs[1:]:
         assert all(torch.equal(image, runs[0][0][name]) for name, image in images.items())
         assert all(torch.equal(gradient, runs[0][1][name]) for name, gradient in gradients.items())
@@ -376,12 +390,57 @@ def test_loading_the_kernels_is_announced_once(caplog):
     assert [record.message.split()[0] for record in caplog.records] == ["Loading", "Rasteriser"]
 
 
+def test_loading_leaves_nothing_to_compile_at_the_first_image():
+    """Else that image takes half a minute after all, without a word."""
+    script = """
+import torch
+from dsar.raster import cpu, rasterize
+from dsar.types import Camera, Gaussians
+kernels = [value for value in vars(cpu).values() if hasattr(value, "signatures")]
+cpu._load_kernels()
+loaded = [len(kernel.signatures) for kernel in kernels]
+gaussians = Gaussians(
+    torch.rand(50, 3) + torch.tensor([0.0, 0.0, 1.0]), torch.rand(50, 4), torch.rand(50, 3) * 0.1,
+    torch.rand(50), torch.rand(50, 16, 3),
+).map(torch.Tensor.requires_grad_)
+camera = Camera(torch.tensor([[40.0, 0, 20], [0, 40, 15], [0, 0, 1]]), torch.eye(4), 40, 30, "front")
+for extras in ((), ("median_depth", "contributors")):
+    rasterize(gaussians, camera, antialiased=True, outputs=extras).color.sum().backward()
+assert len(kernels) >= 6 and min(loaded) == 1, loaded
+assert [len(kernel.signatures) for kernel in kernels] == loaded
+"""
+    subprocess.run([sys.executable, "-c", script], check=True)
+
+
+def test_kernels_are_compiled_anew_when_what_they_share_changes():
+    stamp = cpu.composite_part._cache._cache_file._source_stamp
+    assert {"simd.py", "tiles.py", "conventions.py"} <= {name for name, _, _ in stamp[1]}
+
+
+def test_a_list_of_tiles_that_would_not_fit_is_refused(monkeypatch):
+    monkeypatch.setattr(cpu, "_MOST_PAIRS", 11)
+    wall = one_gaussian(scales=torch.full((1, 3), 50.0))
+    with pytest.raises(RasterError, match="1 Gaussians cover 12 tiles"):
+        rasterize(wall, make_camera())
+
+
+def test_fields_need_not_be_contiguous():
+    gaussians = make_gaussians(40, k=4).map(torch.Tensor.float)
+    strided = gaussians.map(lambda values: values.repeat_interleave(2, -1)[..., ::2])
+    assert not strided.means.is_contiguous()
+    assert torch.equal(draw(strided, make_camera(), "cpu").color, draw(gaussians, make_camera(), "cpu").color)
+
+
 def test_inputs_that_do_not_fit_are_refused():
     gaussians, camera = one_gaussian(), make_camera()
     skewed = camera.K.clone()
     skewed[0, 1] = 2.0
     with pytest.raises(CaptureError, match="fx, fy > 0"):
         rasterize(gaussians, dataclasses.replace(camera, K=skewed))
+    with pytest.raises(CaptureError, match="not finite"):
+        rasterize(gaussians, dataclasses.replace(camera, T_camera_world=camera.T_camera_world * math.nan))
+    with pytest.raises(ConfigError, match="dilation must be positive"):
+        rasterize(gaussians, camera, dilation=0.0)
     with pytest.raises(CaptureError, match="0 x 37 pixels"):
         rasterize(gaussians, dataclasses.replace(camera, width=0))
     with pytest.raises(ConfigError, match="not 3"):
