@@ -13,7 +13,7 @@ from torch import Tensor
 from dsar.geometry.harmonics import rotate_harmonics
 from dsar.geometry.rotations import quaternion_multiply
 from dsar.raster.jit import inlined, kernel
-from dsar.raster.simd import LANES, choose, load, square_root, store
+from dsar.raster.simd import LANES, choose, planes, square_root, write_plane
 from dsar.types import Gaussians
 
 _POLAR_STEPS = 6
@@ -68,9 +68,9 @@ def _nearest_quaternions(matrices):
 @inlined
 def _find_quaternions(scratch):
     """Replace matrices by quaternions: Newton's R <- (R + R^-T) / 2 (Higham 1986), then Shepperd's method."""
-    a, b, c = _planes(scratch, 0)
-    d, e, f = _planes(scratch, 3)
-    g, h, k = _planes(scratch, 6)
+    a, b, c = planes(scratch, 0)
+    d, e, f = planes(scratch, 3)
+    g, h, k = planes(scratch, 6)
     for _ in range(_POLAR_STEPS):
         # Cofactors over the determinant are the inverse transpose.
         ca, cb, cc = e * k - f * h, f * g - d * k, d * h - e * g
@@ -90,14 +90,4 @@ def _find_quaternions(scratch):
     norm = _ONE / square_root(w * w + x * x + y * y + z * z)
     norm = choose(w < _ZERO, -norm, norm)
     for place, value in enumerate((w, x, y, z)):
-        store(scratch, np.uint64(place * LANES), value * norm)
-
-
-@inlined
-def _planes(scratch, first):
-    """Return three consecutive planes."""
-    return (
-        load(scratch, np.uint64(first * LANES)),
-        load(scratch, np.uint64((first + 1) * LANES)),
-        load(scratch, np.uint64((first + 2) * LANES)),
-    )
+        write_plane(scratch, place, value * norm)

@@ -28,16 +28,11 @@ from dsar.raster.kernels_binning import (
     place_pairs,
     sort_by_depth,
 )
-from dsar.raster.kernels_compositing import (
-    SUMS_SIZE,
-    composite_backward_part,
-    composite_part,
-    survey_part,
-)
+from dsar.raster.kernels_compositing import composite_backward_part, composite_part, survey_part
 from dsar.raster.kernels_projection import project_backward_part, project_part
 from dsar.raster.kernels_shading import shade_backward_part, shade_part
 from dsar.raster.parallel import part_count, run_parts
-from dsar.raster.tiles import RECORD_SIZE, TILE
+from dsar.raster.tiles import RECORD_SIZE, SUMS_SIZE, TILE
 from dsar.types import Camera, Contributors, Gaussians, RenderOutput
 
 _log = logging.getLogger(__name__)

@@ -16,15 +16,13 @@ import numpy as np
 from dsar.raster.conventions import ALPHA_MIN
 from dsar.raster.jit import inlined, kernel
 from dsar.raster.simd import LANES, bits_of, larger, load, prefetch, smaller, spread, square_root
-from dsar.raster.tiles import BLOCK_HEIGHT, BLOCK_WIDTH, COLUMNS, RECORD_SIZE, STRIPS, TILE, TILE_BITS
+from dsar.raster.tiles import AHEAD, BLOCK_HEIGHT, BLOCK_WIDTH, COLUMNS, RECORD_SIZE, STRIPS, TILE, TILE_BITS
 
 FIRST_ROWS = np.array([BLOCK_HEIGHT * strip + 0.5 for strip in range(LANES)], np.float32)
 """Centre of each strip's first pixel row, from the tile's top; lanes beyond the last strip are not used."""
 
 _RADIX_BITS = 11
 _RADIX = 1 << _RADIX_BITS
-# How many splats ahead a record is fetched: in order of depth they lie all over the memory.
-_AHEAD = 8
 _LOG_ALPHA_MIN = np.float32(math.log2(ALPHA_MIN))
 _ALL_STRIPS = np.uint32((1 << STRIPS) - 1)
 _ZERO, _HALF = np.float32(0), np.float32(0.5)
@@ -61,8 +59,8 @@ def sort_by_depth(records, bounds):
 @inlined
 def _fetch_ahead(records, order, k):
     """Have the record of a splat that is due soon brought into the cache."""
-    if k + _AHEAD < len(order):
-        prefetch(records, np.uint64(order[k + _AHEAD]) * np.uint64(RECORD_SIZE))
+    if k + AHEAD < len(order):
+        prefetch(records, np.uint64(order[k + AHEAD]) * np.uint64(RECORD_SIZE))
 
 
 @inlined
@@ -173,7 +171,7 @@ def gather_sums_part(part, parts, splat_starts, places, pair_sums, sums):
         for k in range(sums.shape[1]):
             sums[i, k] = _ZERO
         for own in range(splat_starts[i], splat_starts[i + 1]):
-            if own + _AHEAD < len(places):
-                prefetch(flat, np.uint64(places[own + _AHEAD]) * np.uint64(sums.shape[1]))
+            if own + AHEAD < len(places):
+                prefetch(flat, np.uint64(places[own + AHEAD]) * np.uint64(sums.shape[1]))
             for k in range(sums.shape[1]):
                 sums[i, k] += pair_sums[places[own], k]

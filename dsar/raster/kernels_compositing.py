@@ -11,6 +11,9 @@ contribute to the loss,
 
     dL/dalpha = q T - rest / (1 - alpha).
 
+It leaves SUMS_SIZE sums over the pixels of every pair: with v = dL/d(e1² + e2²) those of v, v e1, v e2,
+v e1², v e1 e2, v e2², then of dL/d(red, green, blue, z).
+
 Work is dealt out in `parts`: a part writes only its own tiles and their pairs, so results do not depend on
 how many there are.
 """
@@ -35,15 +38,10 @@ from dsar.raster.simd import (
     store,
     total,
 )
-from dsar.raster.tiles import BLOCK_HEIGHT, BLOCK_WIDTH, BLOCKS, RECORD_SIZE, STRIPS, TILE
-
-SUMS_SIZE = 10
-"""With v = dL/d(e1² + e2²): sums of v, v e1, v e2, v e1², v e1 e2, v e2²; then dL/d(red, green, blue, z)."""
+from dsar.raster.tiles import AHEAD, BLOCK_HEIGHT, BLOCK_WIDTH, BLOCKS, RECORD_SIZE, STRIPS, TILE
 
 # How many splats pass between two looks at which blocks are finished.
 _PATIENCE = 32
-# How many splats ahead a record is fetched: as long as a trip to the third cache takes.
-_AHEAD = 8
 # Planes of a block. Both passes: transmittance, pixel centre x and y (from the tile's corner).
 _T, _X, _Y = (np.uint64(plane * LANES) for plane in (0, 1, 2))
 # Forward: what has been blended so far.
@@ -106,7 +104,7 @@ def _find_live(state, stride):
 @inlined
 def _fetch_ahead(records, pairs, place):
     """Have the record of a splat that is due soon brought into the cache."""
-    due = place + np.uint64(_AHEAD)
+    due = place + np.uint64(AHEAD)
     if due < np.uint64(len(pairs)):
         prefetch(records, np.uint64(pairs[due, 0]) * np.uint64(RECORD_SIZE))
 

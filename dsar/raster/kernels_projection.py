@@ -26,14 +26,16 @@ from dsar.raster.simd import (
     LANES,
     choose,
     larger,
-    load,
     log_two,
+    plane,
+    planes,
     round_down,
     smaller,
     spread,
     square_root,
-    store,
+    write_plane,
 )
+from dsar.raster.tiles import SUMS_SIZE
 
 _NEAR = np.float32(NEAR)
 _MARGIN = np.float32(0.5 * FRUSTUM_MARGIN)
@@ -70,22 +72,6 @@ def _row(matrix, start):
 
 
 @inlined
-def _plane(scratch, index):
-    return load(scratch, np.uint64(index * LANES))
-
-
-@inlined
-def _planes(scratch, index):
-    """Return three consecutive planes."""
-    return _plane(scratch, index), _plane(scratch, index + 1), _plane(scratch, index + 2)
-
-
-@inlined
-def _write(scratch, index, values):
-    store(scratch, np.uint64(index * LANES), values)
-
-
-@inlined
 def _lay_out(scratch, start, end, means, rotations, scales, opacities):
     """Copy LANES rows into the scratch planes; the last row stands in for those beyond the end."""
     for lane in range(LANES):
@@ -101,7 +87,7 @@ def _lay_out(scratch, start, end, means, rotations, scales, opacities):
 @inlined
 def _unit_quaternion(scratch):
     """Return quaternions normalised, and the inverses of their norms (infinite for a zero quaternion)."""
-    w, (x, y, z) = _plane(scratch, _ROTATION), _planes(scratch, _ROTATION + 1)
+    w, (x, y, z) = plane(scratch, _ROTATION), planes(scratch, _ROTATION + 1)
     inverse = _ONE / square_root(w * w + x * x + y * y + z * z)
     return w * inverse, x * inverse, y * inverse, z * inverse, inverse
 
@@ -192,17 +178,15 @@ def _covariance(m1, m2, normal, dilation):
 @inlined
 def _pixel_range(center, radius, size):
     """Return the first and end index of the pixels whose centres lie within a radius, inside the image."""
-    first = -round_down(radius + _HALF - center)
-    end = round_down(center + radius + _HALF)
-    return smaller(larger(first, spread(_ZERO)), spread(size)), smaller(
-        larger(end, spread(_ZERO)), spread(size)
-    )
+    first, end = -round_down(radius + _HALF - center), round_down(center + radius + _HALF)
+    low, high = spread(_ZERO), spread(size)
+    return smaller(larger(first, low), high), smaller(larger(end, low), high)
 
 
 @inlined
 def _project(scratch, camera, width, height):
     """Replace Gaussians in the scratch planes by their records and bounds."""
-    mean, scales, opacity = _planes(scratch, _MEAN), _planes(scratch, _SCALES), _plane(scratch, _OPACITY)
+    mean, scales, opacity = planes(scratch, _MEAN), planes(scratch, _SCALES), plane(scratch, _OPACITY)
     point = _camera_point(mean, camera)
     w, x, y, z, inverse = _unit_quaternion(scratch)
     rows = _rotation_rows(w, x, y, z)
@@ -221,30 +205,25 @@ def _project(scratch, camera, width, height):
     y0, y1 = _pixel_range(mean_y, square_root(reach * c), height)
     # Comparisons with NaN fail, and so does one with an infinite or NaN sum.
     finite = mean_x + mean_y + point[2] + a + c + slim + opacity
-    drawn = (point[2] > _NEAR) & (opacity >= _ALPHA_MIN) & (finite <= _LARGEST) & (finite >= -_LARGEST)
+    sound = (finite <= _LARGEST) & (finite >= -_LARGEST)
     # A quaternion whose square overflows has no inverse norm.
-    drawn = (
-        drawn
-        & (inverse > _ZERO)
-        & (smaller(smaller(scales[0], scales[1]), scales[2]) > _ZERO)
-        & (x0 < x1)
-        & (y0 < y1)
-    )
+    sound = sound & (inverse > _ZERO) & (smaller(smaller(scales[0], scales[1]), scales[2]) > _ZERO)
+    drawn = sound & (point[2] > _NEAR) & (opacity >= _ALPHA_MIN) & (x0 < x1) & (y0 < y1)
     stretch = square_root(_HALF * _LOG2_E / slim)
-    _write(scratch, 0, mean_x)
-    _write(scratch, 1, mean_y)
-    _write(scratch, 2, stretch)
-    _write(scratch, 3, stretch * b / c)
-    _write(scratch, 4, square_root(_HALF * _LOG2_E / c))
-    _write(scratch, 5, log_opacity)
-    _write(scratch, 9, point[2])
-    _write(scratch, 10, square_root(reach * c))
-    _write(scratch, 11, b * square_root(reach / a))
+    write_plane(scratch, 0, mean_x)
+    write_plane(scratch, 1, mean_y)
+    write_plane(scratch, 2, stretch)
+    write_plane(scratch, 3, stretch * b / c)
+    write_plane(scratch, 4, square_root(_HALF * _LOG2_E / c))
+    write_plane(scratch, 5, log_opacity)
+    write_plane(scratch, 9, point[2])
+    write_plane(scratch, 10, square_root(reach * c))
+    write_plane(scratch, 11, b * square_root(reach / a))
     nothing = spread(_ZERO)
-    _write(scratch, _BOUNDS, choose(drawn, x0, nothing))
-    _write(scratch, _BOUNDS + 1, choose(drawn, x1, nothing))
-    _write(scratch, _BOUNDS + 2, choose(drawn, y0, nothing))
-    _write(scratch, _BOUNDS + 3, choose(drawn, y1, nothing))
+    write_plane(scratch, _BOUNDS, choose(drawn, x0, nothing))
+    write_plane(scratch, _BOUNDS + 1, choose(drawn, x1, nothing))
+    write_plane(scratch, _BOUNDS + 2, choose(drawn, y0, nothing))
+    write_plane(scratch, _BOUNDS + 3, choose(drawn, y1, nothing))
 
 
 @kernel
@@ -269,8 +248,8 @@ def _splat_gradient(scratch, a, b, c, slim):
     """Return dL/d(mean x, mean y, A, B, C) from a splat's sums over its pixels (see kernels_compositing)."""
     stretch, height, ratio = square_root(_HALF * _LOG2_E / slim), square_root(_HALF * _LOG2_E / c), b / c
     # The sums are of powers of e, the factors in powers of two.
-    v_e1, v_e2 = (_TWO * _LN_2) * _plane(scratch, _SUMS + 1), (_TWO * _LN_2) * _plane(scratch, _SUMS + 2)
-    v_e11, v_e12, v_e22 = _planes(scratch, _SUMS + 3)
+    v_e1, v_e2 = (_TWO * _LN_2) * plane(scratch, _SUMS + 1), (_TWO * _LN_2) * plane(scratch, _SUMS + 2)
+    v_e11, v_e12, v_e22 = planes(scratch, _SUMS + 3)
     v_x = stretch * v_e1
     v_y = height * v_e2 - ratio * stretch * v_e1
     v_slim = -(_LN_2 * v_e11 / slim)
@@ -298,10 +277,10 @@ def _write_rotation_gradient(scratch, u1, u2, v_g1, v_g2, quaternion):
     v_z = x * (v02 + v20) + y * (v12 + v21) - _TWO * z * (v00 + v11) + w * (v10 - v01)
     radial = w * v_w + x * v_x + y * v_y + z * v_z
     twice = _TWO * inverse
-    _write(scratch, _ROTATION, twice * (v_w - w * radial))
-    _write(scratch, _ROTATION + 1, twice * (v_x - x * radial))
-    _write(scratch, _ROTATION + 2, twice * (v_y - y * radial))
-    _write(scratch, _ROTATION + 3, twice * (v_z - z * radial))
+    write_plane(scratch, _ROTATION, twice * (v_w - w * radial))
+    write_plane(scratch, _ROTATION + 1, twice * (v_x - x * radial))
+    write_plane(scratch, _ROTATION + 2, twice * (v_y - y * radial))
+    write_plane(scratch, _ROTATION + 3, twice * (v_z - z * radial))
 
 
 @inlined
@@ -316,11 +295,11 @@ def _write_mean_gradient(scratch, point, camera, u1, u2, free_x, free_y, v_u1, v
     v_down = (camera[13] * v_y + v_ty) * inverse_z
     # u1 and u2 are proportional to 1/z, and so are the tangents.
     v_log_z = _dot(v_u1, u1) + _dot(v_u2, u2) + v_right * point[0] + v_down * point[1]
-    v_forward = _plane(scratch, _SUMS + 9) - v_log_z * inverse_z
+    v_forward = plane(scratch, _SUMS + 9) - v_log_z * inverse_z
     right, down = _row(camera, 0), _row(camera, 3)
     for axis in range(3):
         v_mean = right[axis] * v_right + down[axis] * v_down + forward[axis] * v_forward
-        _write(scratch, _MEAN + axis, v_mean)
+        write_plane(scratch, _MEAN + axis, v_mean)
 
 
 @inlined
@@ -340,7 +319,7 @@ def _normal_gradient(v_log, normal, g1, g2, scales):
 @inlined
 def _project_backward(scratch, camera, width, height):
     """Replace Gaussians in the scratch planes by their gradients."""
-    mean, scales, opacity = _planes(scratch, _MEAN), _planes(scratch, _SCALES), _plane(scratch, _OPACITY)
+    mean, scales, opacity = planes(scratch, _MEAN), planes(scratch, _SCALES), plane(scratch, _OPACITY)
     point = _camera_point(mean, camera)
     quaternion = _unit_quaternion(scratch)
     rows = _rotation_rows(quaternion[0], quaternion[1], quaternion[2], quaternion[3])
@@ -351,7 +330,7 @@ def _project_backward(scratch, camera, width, height):
     a, b, c, slim = _covariance(m1, m2, normal, camera[16])
     v_x, v_y, v_a, v_b, v_c = _splat_gradient(scratch, a, b, c, slim)
     # Antialiased, opacity is proportional to |normal| / sqrt(slim c).
-    v_log = -_plane(scratch, _SUMS) if camera[17] > _ZERO else spread(_ZERO)
+    v_log = -plane(scratch, _SUMS) if camera[17] > _ZERO else spread(_ZERO)
     v_a += -(_HALF * v_log / slim)
     v_b += v_log * b / (slim * c)
     v_c += -(_HALF * v_log * a / (slim * c))
@@ -375,14 +354,14 @@ def _project_backward(scratch, camera, width, height):
     if camera[17] > _ZERO:
         extra, extra1, extra2 = _normal_gradient(v_log, normal, g1, g2, scales)
         v_scales, v_g1, v_g2 = _sum(v_scales, extra), _sum(v_g1, extra1), _sum(v_g2, extra2)
-    _write(scratch, _SCALES, v_scales[0])
-    _write(scratch, _SCALES + 1, v_scales[1])
-    _write(scratch, _SCALES + 2, v_scales[2])
+    write_plane(scratch, _SCALES, v_scales[0])
+    write_plane(scratch, _SCALES + 1, v_scales[1])
+    write_plane(scratch, _SCALES + 2, v_scales[2])
     _write_rotation_gradient(scratch, u1, u2, v_g1, v_g2, quaternion)
     v_u1 = (_dot(rows[0], v_g1), _dot(rows[1], v_g1), _dot(rows[2], v_g1))
     v_u2 = (_dot(rows[0], v_g2), _dot(rows[1], v_g2), _dot(rows[2], v_g2))
     _write_mean_gradient(scratch, point, camera, u1, u2, free_x, free_y, v_u1, v_u2, v_x, v_y)
-    _write(scratch, _OPACITY, -(_plane(scratch, _SUMS) / opacity))
+    write_plane(scratch, _OPACITY, -(plane(scratch, _SUMS) / opacity))
 
 
 @kernel
@@ -398,7 +377,7 @@ def project_backward_part(
     for start in range(n * part // parts, end, LANES):
         _lay_out(scratch, start, end, means, rotations, scales, opacities)
         for lane in range(LANES):
-            for k in range(10):
+            for k in range(SUMS_SIZE):
                 scratch[(_SUMS + k) * LANES + lane] = sums[min(start + lane, end - 1), k]
         _project_backward(scratch, camera, width, height)
         for lane in range(min(LANES, end - start)):

@@ -17,6 +17,8 @@ from numba.core.imputils import lower_builtin
 from numba.core.typing.templates import ConcreteTemplate, infer_global, signature
 from numba.extending import intrinsic, models, register_model
 
+from dsar.raster.jit import inlined
+
 LANES = 16 if llvmlite.binding.get_host_cpu_features().get("avx512f", False) else 8
 """Lanes of a register: as many as this machine's hold. Where they hold four, eight are two registers."""
 
@@ -143,6 +145,24 @@ def store(typing, array, index, values):
         return context.get_dummy_value()
 
     return (types.void(array, types.uintp, floats), emit) if _is_flat(array) else None
+
+
+@inlined
+def plane(scratch, index):
+    """Return one plane of a scratch array, which holds as many planes of LANES values as its kernel needs."""
+    return load(scratch, np.uint64(index * LANES))
+
+
+@inlined
+def planes(scratch, first):
+    """Return three consecutive planes of a scratch array."""
+    return plane(scratch, first), plane(scratch, first + 1), plane(scratch, first + 2)
+
+
+@inlined
+def write_plane(scratch, index, values):
+    """Write one plane of a scratch array."""
+    store(scratch, np.uint64(index * LANES), values)
 
 
 @_operation

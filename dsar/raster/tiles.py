@@ -9,6 +9,11 @@ from dsar.raster.simd import LANES
 
 RECORD_SIZE = 16
 """Numbers in a splat's record (see kernels_projection): a cache line."""
+SUMS_SIZE = 10
+"""Numbers in the gradient sums of a splat, or of its pair with a tile (see kernels_compositing)."""
+AHEAD = 8
+"""How many splats before its turn a record is fetched (in order of depth they lie all over the memory): as
+long as a trip to the third cache takes."""
 TILE_BITS = 4
 TILE = 1 << TILE_BITS
 """Pixels along a tile's side."""
