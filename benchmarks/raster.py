@@ -16,8 +16,6 @@ from machine import count_memory, describe_machine, measure_peak, read_load  # i
 import argparse
 import gc
 import importlib.util
-import json
-import os
 import shlex
 import sys
 from dataclasses import asdict, dataclass
@@ -28,6 +26,7 @@ import numpy as np
 import torch
 from fragments import Work, count_work
 from report import describe_arithmetic, describe_ratio, describe_rival, describe_row, describe_stages
+from results import write_json
 from rivals import NOT_COMPARED, OURS, RIVALS, Rival, Scene
 from scene import make_body, make_camera
 from stages import measure_stages
@@ -239,14 +238,6 @@ def find_stages(plan: Plan, threads: list[int], peaks: dict[int, float]) -> list
             share = {name: rate / peaks[count] for name, rate in stages.gflops.items()}
             found.append(case | asdict(stages) | {"share_of_peak": share})
     return found
-
-
-def write_json(found: dict, path: Path) -> None:
-    """Write what was found, whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(".tmp")
-    temporary.write_text(json.dumps(found, indent=2))
-    os.replace(temporary, path)
 
 
 def main() -> None:

@@ -1,7 +1,7 @@
 """How long a function takes: medians with their spread, on a machine that others use too."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,8 +30,13 @@ def time_once(function: Callable[[], object]) -> float:
 
 def time_runs(function: Callable[[], object], seconds: float, most: int) -> Timing:
     """Run a function until `seconds` or `most` runs are over, but at least LEAST_RUNS times."""
-    times = []
-    while len(times) < LEAST_RUNS or (sum(times) < seconds and len(times) < most):
-        times.append(time_once(function))
-    low, median, high = 1e3 * np.percentile(times, [25, 50, 75])
-    return Timing(float(median), float(low), float(high), len(times))
+    return time_together([function], seconds, most)[0]
+
+
+def time_together(functions: Sequence[Callable[[], object]], seconds: float, most: int) -> list[Timing]:
+    """Run functions in turn, so that all meet the same machine, until `seconds` or `most` rounds are over."""
+    rounds: list[list[float]] = []
+    while len(rounds) < LEAST_RUNS or (sum(map(sum, rounds)) < seconds and len(rounds) < most):
+        rounds.append([time_once(function) for function in functions])
+    quartiles = 1e3 * np.percentile(rounds, [25, 50, 75], axis=0)
+    return [Timing(*map(float, times), len(rounds)) for times in quartiles[[1, 0, 2]].T]

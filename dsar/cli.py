@@ -64,6 +64,8 @@ class Train(Common):
     """Frames of each training sequence, e.g. 0-239."""
     test_frames: str | None = None
     """Frames of each test sequence, e.g. 250-359."""
+    cameras: int | None = None
+    """Cameras to learn from, spread as far as can be; default: all."""
     steps: int | None = None
     """Updates in all."""
     minutes: float | None = None
@@ -95,6 +97,7 @@ class Train(Common):
             body=None if self.body is None else str(self.body),
             train_frames=self.train_frames,
             test_frames=self.test_frames,
+            cameras=self.cameras,
             seed=self.seed,
             workers=preset.workers if self.workers is None else self.workers,
             atlas=self.atlas,

@@ -31,9 +31,10 @@ class AtlasConfig:
 class ModelConfig:
     """The network."""
 
-    wiring: Literal["shared", "perframe"] = "perframe"
+    wiring: Literal["shared", "late", "perframe"] = "perframe"
     """`shared` feeds the previous offset to every frame of the window (the paper: n encodings a step);
-    `perframe` gives each frame the offset that preceded it (one encoding a step)."""
+    `perframe` gives each frame the offset that preceded it (one encoding a step); `late` encodes poses by
+    themselves (one a step) and adds features of the previous offset to every frame's."""
     axes: Literal["body", "surface"] = "surface"
     """Axes of offsets, velocities and accelerations: `body` is canonical and heading axes (the paper);
     `surface` is each texel's own side, up and normal, so that a flare is the same number all around."""
@@ -41,8 +42,15 @@ class ModelConfig:
     """Frames n that the network sees, the current one included."""
     memory: int = 6
     """Hidden states m in the memory bank; 0 removes the state stream."""
-    feedback: bool = True
-    """Feed the previous offset back (the geometric stream)."""
+    bank: Literal["hidden", "features"] = "hidden"
+    """What the memory bank keeps of a frame: its hidden state h, or its deepest features before any attention
+    (with `memory` 1: the paper's direct attention to the previous frame)."""
+    feedback: int = 1
+    """Previous offsets fed back (the geometric stream; the paper: 1, in ablations 3 and 5); 0 removes it."""
+    causal: bool = True
+    """Frames of the window attend to none that is younger. It matters for the readout `mean` only."""
+    readout: Literal["last", "mean"] = "last"
+    """What the window's attention hands on: the newest frame's row (the paper), or the mean of all rows."""
     velocity: bool = True
     """Feed velocity maps."""
     acceleration: bool = True
@@ -57,7 +65,10 @@ class ModelConfig:
     heads: int = 4
     """Attention heads of both attentions."""
     upsample: int = 8
-    """Atlas texels per network pixel, each way (1: the paper's)."""
+    """Atlas texels per pixel of the network's maps, each way (1: the paper's)."""
+    pixel_shuffle: int = 1
+    """Pixels of its maps per cell of the network's finest level, each way (1: the paper's): with 2, a quarter
+    of the work."""
     identity_channels: int = 8
     """Channels of a learnt static map that tells pixels apart (extension)."""
     recall: float = 0.5
@@ -111,7 +122,14 @@ class LossConfig:
     temporal_scale: float = 0.001
     """Common factor of the three temporal losses, whose unit the paper does not give."""
     still_speed: float = 0.3
-    """tau_reg in m/s: the motion magnitude at which the temporal weight has fallen to 1/e."""
+    """tau_reg in m/s: the motion magnitude V at which the temporal weight has fallen to 1/e."""
+    adaptive: bool = True
+    """Weigh prediction and smoothness by exp(-V / tau_reg); off: by 1."""
+    magnitude: Literal["window", "frame"] = "window"
+    """V of that weight: the newest frame's (the paper), or the largest in the window: at a stop V falls to
+    zero at once, exactly when the cloth swings most."""
+    reduction: Literal["mean", "sum"] = "mean"
+    """Temporal losses over elements. The paper writes sums: over millions of features they drown images."""
 
 
 @dataclass(frozen=True)
@@ -176,6 +194,8 @@ class TrainConfig:
     """Frame range of each training sequence, e.g. 0-239; none: all."""
     test_frames: str | None = None
     """Frame range of each test sequence; none: all."""
+    cameras: int | None = None
+    """Cameras to learn from, spread as far as can be; none: all."""
     seed: int = 0
     """Seed of initialisation and sampling."""
     workers: int = 2
@@ -188,19 +208,27 @@ class TrainConfig:
     def validate(self) -> None:
         """Raise ConfigError where settings contradict each other."""
         atlas, model = self.atlas, self.model
-        grid = model.upsample * 2 ** (len(model.channels) - 1)
+        grid = model.upsample * model.pixel_shuffle * 2 ** (len(model.channels) - 1)
         for name, size in (("resolution", atlas.resolution), ("garment_rows", atlas.garment_rows)):
             if size % grid:
                 raise ConfigError(
-                    f"atlas.{name} is {size}; with model.upsample {model.upsample} and {len(model.channels)} "
-                    f"levels it must be a multiple of {grid}"
+                    f"atlas.{name} is {size}; with model.upsample {model.upsample}, model.pixel_shuffle "
+                    f"{model.pixel_shuffle} and {len(model.channels)} levels it must be a multiple of {grid}"
                 )
         if model.channels[-1] % model.heads:
             raise ConfigError(
                 f"model.channels ends in {model.channels[-1]}, not a multiple of {model.heads} heads"
             )
-        if model.window < 1 or model.memory < 0:
-            raise ConfigError(f"model.window is {model.window} (>= 1) and model.memory {model.memory} (>= 0)")
+        if model.window < 1 or model.memory < 0 or model.feedback < 0:
+            raise ConfigError(
+                f"model.window is {model.window} (>= 1), model.memory {model.memory} and model.feedback "
+                f"{model.feedback} (>= 0)"
+            )
+        if not model.causal and model.readout == "last":
+            raise ConfigError(
+                "model.causal is off, but the newest row of one attention sees every frame anyway: nothing "
+                "would change; give --model.readout mean too, and compare with that"
+            )
         if any(lag <= 0 for lag in model.lags):
             raise ConfigError(f"model.lags is {model.lags}; they are seconds, above 0")
         if not 0 < model.recall < 1:
@@ -239,7 +267,14 @@ PRESETS: dict[str, TrainConfig] = {
             appearance_scale=1.0,
         ),
         loss=LossConfig(
-            pyramid=1, ssim=0.2, lpips=0.5, alpha=0.0, spatial=0.0, registered=0.0, temporal_scale=1.0
+            pyramid=1,
+            ssim=0.2,
+            lpips=0.5,
+            alpha=0.0,
+            spatial=0.0,
+            registered=0.0,
+            temporal_scale=1.0,
+            magnitude="frame",
         ),
         schedule=ScheduleConfig(
             steps=300_000,

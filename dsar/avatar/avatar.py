@@ -1,5 +1,7 @@
 """The avatar: template, network and skeleton; one step of it makes one frame of posed Gaussians."""
 
+from collections.abc import Collection
+
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor, nn
@@ -15,7 +17,7 @@ from dsar.body.model import PARENTS, Body
 from dsar.body.skinning import forward_kinematics
 from dsar.config import AtlasConfig, ModelConfig
 from dsar.geometry.rotations import heading_matrix
-from dsar.network import DualStreamNetwork, NetworkOutput, NetworkState
+from dsar.network import STREAMS, DualStreamNetwork, NetworkOutput, NetworkState, Stream
 from dsar.network.maps import FrameMaps, maps_from_points
 from dsar.types import Capture, Gaussians, Motion
 
@@ -193,13 +195,21 @@ class Avatar(nn.Module):
         self.template.opacity_logits[self.texel_hidden] = SHOWN
         self.texel_hidden.fill_(False)
 
+    def standardized(self, observed: FrameMaps) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 1 h w"]]:
+        """Return input maps and motion magnitude as the network takes them."""
+        maps = (observed.maps - self.map_mean) / self.map_scale * self.network.occupied
+        return maps, observed.speed / self.speed_scale
+
     def advance(
-        self, context: Float[Tensor, "b t j 4 4"], state: NetworkState, *, streams: bool = True
+        self,
+        context: Float[Tensor, "b t j 4 4"],
+        state: NetworkState,
+        *,
+        streams: Collection[Stream] = STREAMS,
     ) -> tuple[NetworkOutput, NetworkState, FrameMaps]:
         """Run the network one frame on; return its output, the next state and the maps it saw."""
         observed = self.maps(context, self.fps)
-        maps = (observed.maps - self.map_mean) / self.map_scale * self.network.occupied
-        output, state = self.network(maps, observed.speed / self.speed_scale, state, streams=streams)
+        output, state = self.network(*self.standardized(observed), state, streams=streams)
         return output, state, observed
 
     def gaussians(self, context: Float[Tensor, "b t j 4 4"], output: NetworkOutput | None) -> list[Gaussians]:

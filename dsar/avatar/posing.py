@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dsar.geometry.harmonics import rotate_harmonics
-from dsar.geometry.rotations import quaternion_multiply
+from dsar.geometry.rotations import quaternion_from_matrix, quaternion_multiply
 from dsar.raster.jit import inlined, kernel
 from dsar.raster.simd import LANES, choose, planes, square_root, write_plane
 from dsar.types import Gaussians
@@ -44,9 +44,22 @@ def pose_gaussians(
 
 def nearest_quaternions(matrices: Float[Tensor, "b n 3 3"]) -> Float[Tensor, "b n 4"]:
     """Return the unit quaternion wxyz of each matrix's nearest rotation; no gradient flows through it."""
-    flat = matrices.detach().reshape(-1, 9).float().cpu().contiguous().numpy()
-    quaternions = _nearest_quaternions(flat)
+    flat = matrices.detach().reshape(-1, 9)
+    if flat.is_cuda:
+        return _nearest_quaternions_plain(flat).reshape(*matrices.shape[:-2], 4)
+    quaternions = _nearest_quaternions(flat.float().contiguous().numpy())
     return torch.from_numpy(quaternions).to(matrices).reshape(*matrices.shape[:-2], 4)
+
+
+def _nearest_quaternions_plain(matrices: Float[Tensor, "n 9"]) -> Float[Tensor, "n 4"]:
+    """Return the same in plain torch, for other devices."""
+    R = matrices.reshape(-1, 3, 3)
+    for _ in range(_POLAR_STEPS):
+        rows = R.unbind(1)
+        cofactors = torch.stack([torch.linalg.cross(rows[i - 2], rows[i - 1]) for i in range(3)], 1)
+        determinant = (rows[0] * cofactors[:, 0]).sum(-1)[:, None, None]
+        R = 0.5 * (R + cofactors / determinant)
+    return quaternion_from_matrix(R)
 
 
 @kernel

@@ -1,7 +1,7 @@
 """Drive an avatar through a motion, one frame in memory at a time."""
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 
 import torch
 from jaxtyping import Float
@@ -10,6 +10,8 @@ from torch import Tensor
 from dsar.avatar.avatar import Avatar
 from dsar.avatar.track import contexts
 from dsar.errors import MotionError
+from dsar.network import STREAMS, NetworkOutput, Stream
+from dsar.network.streaming import Rollout
 from dsar.types import Gaussians, GaussianSequence, Motion
 
 START_FRAME = 1001
@@ -21,12 +23,14 @@ def roll_out(
     motion: Motion,
     *,
     frames: Sequence[int] | None = None,
+    streams: Collection[Stream] = STREAMS,
     provenance: dict[str, str] | None = None,
 ) -> GaussianSequence:
     """Return the avatar's posed Gaussians over a motion at the avatar's frame rate.
 
     Every frame up to the last requested one is computed, since each follows from the one before;
-    only those in `frames` (numbers from 1001 on; None: all) are yielded.
+    only those in `frames` (numbers from 1001 on; None: all) are yielded. Without one of the `streams`
+    the network runs as if it had none of its memory: an ablation of a network trained with it.
 
     Raises:
         MotionError: the rate is not the avatar's, or a requested frame lies outside the motion.
@@ -48,7 +52,7 @@ def roll_out(
         frame_numbers=numbers,
         fps=avatar.fps,
         num_gaussians=avatar.num_gaussians,
-        produce=lambda: _produce(avatar, avatar.track(motion), {n - START_FRAME for n in numbers}),
+        produce=lambda: _produce(avatar, motion, {n - START_FRAME for n in numbers}, streams),
         provenance={"motion": motion.name, **(provenance or {})},
     )
 
@@ -65,12 +69,26 @@ def template_sequence(sequence: GaussianSequence, avatar: Avatar, motion: Motion
     return dataclasses.replace(sequence, produce=produce)
 
 
-def _produce(avatar: Avatar, track: Float[Tensor, "f k j 4 4"], wanted: set[int]) -> Iterator[Gaussians]:
-    state = avatar.start()
-    for frame in range(max(wanted) + 1):
+def network_outputs(
+    avatar: Avatar, motion: Motion, *, streams: Collection[Stream] = STREAMS
+) -> Iterator[tuple[Float[Tensor, "1 t j 4 4"], NetworkOutput]]:
+    """Yield each frame's context and what the network makes of it."""
+    track = avatar.track(motion)
+    rollout = Rollout(avatar.network, streams, torch.bfloat16 if track.is_cuda else None)
+    for frame in range(len(track)):
         with torch.no_grad():
             context = contexts(track, torch.tensor([frame]))
-            output, state, _ = avatar.advance(context, state)
-            made = avatar.gaussians(context, output)[0] if frame in wanted else None
-        if made is not None:
+            output = rollout.step(*avatar.standardized(avatar.maps(context, avatar.fps)))
+        yield context, output
+
+
+def _produce(
+    avatar: Avatar, motion: Motion, wanted: set[int], streams: Collection[Stream]
+) -> Iterator[Gaussians]:
+    for frame, (context, output) in enumerate(network_outputs(avatar, motion, streams=streams)):
+        if frame in wanted:
+            with torch.no_grad():
+                made = avatar.gaussians(context, output)[0]
             yield made
+        if frame == max(wanted):
+            return

@@ -1,5 +1,6 @@
 """Captures in our own format: a folder with a capture.json (docs/capture-format.md)."""
 
+import dataclasses
 import io
 import json
 import zipfile
@@ -18,7 +19,8 @@ from torch import Tensor
 from dsar.body.files import load_body
 from dsar.body.model import Body
 from dsar.data.motion import read_motion
-from dsar.errors import CaptureError
+from dsar.errors import CaptureError, ConfigError
+from dsar.geometry.cameras import spread_out
 from dsar.types import Camera, Motion
 
 RECORD_NAME = "capture.json"
@@ -70,6 +72,14 @@ class NativeCapture:
 
     def __reduce__(self) -> tuple[Callable[[Path], "NativeCapture"], tuple[Path]]:
         return open_native, (self.root,)
+
+    def with_cameras(self, count: int | None) -> "NativeCapture":
+        """Return the capture as seen by some of its cameras, spread as far as can be; None: by all."""
+        if count is None:
+            return self
+        if not 1 <= count <= len(self.cameras):
+            raise ConfigError(f"cameras is {count}; capture {self.name} has {len(self.cameras)}")
+        return dataclasses.replace(self, cameras=spread_out(self.cameras, count))
 
     def image(self, sequence: str, frame: int, camera: int) -> UInt8[np.ndarray, "h w 4"]:
         """Return one image: straight (not premultiplied) sRGB and coverage as alpha.

@@ -4,6 +4,7 @@ Ours is OpenCV: x right, y down, z forward; pixel (0, 0) has its centre at (0.5,
 OpenGL and USD: x right, y up, looking along -z. Mitsuba: x left, y up, looking along +z.
 """
 
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -35,6 +36,18 @@ def unproject(
     local = homogeneous @ torch.linalg.inv(camera.K.to(pixels)).T * depth[..., None]
     transform = camera.T_camera_world.to(pixels)
     return (local - transform[:3, 3]) @ transform[:3, :3]
+
+
+def spread_out(cameras: Sequence[Camera], count: int) -> list[Camera]:
+    """Return some cameras in their order: the first, and others as far from those chosen as can be."""
+    transforms = torch.stack([camera.T_camera_world for camera in cameras])
+    centers = -(transforms[:, :3, :3].mT @ transforms[:, :3, 3:])[..., 0]
+    chosen = [0]
+    while len(chosen) < count:
+        nearest = torch.cdist(centers, centers[chosen]).amin(1)
+        nearest[chosen] = -1.0
+        chosen.append(int(nearest.argmax()))
+    return [cameras[i] for i in sorted(chosen)]
 
 
 def look_at(position: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]) -> Float[Tensor, "4 4"]:

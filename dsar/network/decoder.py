@@ -27,4 +27,5 @@ class Decoder(nn.Module):
         for level in reversed(range(len(self.ups))):
             x = self.ups[level](x)
             x = self.blocks[level](torch.cat([x, features[level]], 1))
-        return self.head(x)
+        # In a rollout of 16-bit numbers the head alone keeps 32: a millimetre needs them.
+        return self.head(x.to(self.head.weight.dtype))

@@ -1,20 +1,24 @@
 """The network of the paper's section 3: one step of the autoregression for a batch of rollouts."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 
 from dsar.config import ModelConfig
 from dsar.network.decoder import Decoder
-from dsar.network.layers import ConvBlock, channels_last
-from dsar.network.state import NetworkState
+from dsar.network.encoder import WIRINGS, Window
+from dsar.network.state import NetworkState, push, repeat_where
 from dsar.network.temporal import MemoryBank, MotionEmbedding, TemporalAttention, TemporalMixing
 
 OFFSET_UNIT = 0.1
 """Metres of offset that the geometric stream presents to the encoder as 1."""
+Stream = Literal["geometric", "state"]
+STREAMS: tuple[Stream, ...] = ("geometric", "state")
+"""Both: previous offsets fed back, and the memory bank."""
 
 
 @dataclass(frozen=True)
@@ -35,12 +39,50 @@ class NetworkOutput:
         return NetworkOutput(self.offset[index], self.appearance[index], features)
 
 
+@dataclass(frozen=True)
+class Places:
+    """What depends on where in the window the frames of each age are."""
+
+    age: Float[Tensor, "*p n c"]
+    """Embedding of each frame's age."""
+    ages: Float[Tensor, "*p 2 n c"]
+    """What it adds to keys and values."""
+    weights: tuple[Float[Tensor, "*p n _"], ...]
+    """Each frame's weights in the aggregates of shallow levels, finest first."""
+    younger: Bool[Tensor, "*p n n"]
+    """Which frames (columns) are younger than which (rows)."""
+
+    @classmethod
+    def of(cls, network: "DualStreamNetwork", order: Int64[Tensor, " n"]) -> "Places":
+        """Return those of frames in an order."""
+        attention = network.attention
+        weights = tuple(mix.get_parameter("weights")[order] for mix in network.mixing)
+        return cls(attention.age[order], attention.ages(order), weights, order[:, None] < order)
+
+    @classmethod
+    def stack(cls, places: Sequence["Places"]) -> "Places":
+        """Return several as one, along a new first axis."""
+        levels = zip(*(each.weights for each in places), strict=True)
+        return cls(
+            torch.stack([each.age for each in places]),
+            torch.stack([each.ages for each in places]),
+            tuple(map(torch.stack, levels)),
+            torch.stack([each.younger for each in places]),
+        )
+
+    def choose(self, index: Int64[Tensor, "1"]) -> "Places":
+        """Return one of those that were stacked."""
+        age, ages, younger, *weights = (
+            table.index_select(0, index)[0] for table in (self.age, self.ages, self.younger, *self.weights)
+        )
+        return Places(age, ages, tuple(weights), younger)
+
+
 class DualStreamNetwork(nn.Module):
     """Encoder, temporal aggregation, memory bank and decoder around the two recurrent streams.
 
-    Wiring `shared` is the paper's: the previous offset is concatenated to every frame of the window,
-    so all n frames are encoded anew at each step. `perframe` gives frame tau the offset that preceded
-    it, so a frame's encoding never changes and each is computed once.
+    `forward` is one step of training. A rollout that needs no gradients goes through
+    `dsar.network.streaming`, which takes the same steps and keeps what does not change.
     """
 
     def __init__(self, config: ModelConfig, occupied: Bool[Tensor, "h w"]) -> None:
@@ -48,43 +90,34 @@ class DualStreamNetwork(nn.Module):
         self.config = config
         self.register_buffer("occupied", occupied[None, None].float())
         self.occupied: Tensor
-        channels = config.channels
-        deepest = channels[-1]
-        self.identity = nn.Parameter(0.1 * torch.randn(1, config.identity_channels, *occupied.shape))
-        inputs = config.map_channels + config.identity_channels + 3 * config.feedback
-        strides = [1, *[2] * (len(channels) - 1)]
-        self.encoder = nn.ModuleList(
-            ConvBlock(a, b, s) for a, b, s in zip([inputs, *channels], channels, strides, strict=False)
-        )
+        channels, deepest, fine = config.channels, config.channels[-1], config.pixel_shuffle
+        self.grid = (occupied.shape[0] // fine, occupied.shape[1] // fine)
+        self.encoder = WIRINGS[config.wiring](config, self.grid)
         self.motion_embedding = MotionEmbedding(deepest) if config.motion_embedding else None
         self.attention = TemporalAttention(deepest, config.heads, config.window)
         self.bank = MemoryBank(deepest, config.heads, config.memory, config.recall) if config.memory else None
         self.mixing = nn.ModuleList(TemporalMixing(c, config.window) for c in channels[:-1])
-        self.decoder = Decoder(channels, 3 + config.appearance_channels)
+        self.decoder = Decoder(channels, fine**2 * (3 + config.appearance_channels))
 
     def hidden_weights(self) -> list[nn.Parameter]:
         """Return the convolutions' weights between the inputs and the head."""
-        others = (self.identity, self.decoder.head.weight)
+        others = (self.encoder.identity, self.decoder.head.weight)
         return [p for p in self.parameters() if p.ndim == 4 and not any(p is other for other in others)]
+
+    def level_size(self, level: int) -> tuple[int, int]:
+        """Return height and width of a level of the hierarchy, 0 the finest."""
+        return -(-self.grid[0] // 2**level), -(-self.grid[1] // 2**level)
 
     def start(self, batch: int) -> NetworkState:
         """Return the state of rollouts that have seen nothing yet."""
-        c, (h, w) = self.config, self.occupied.shape[2:]
-        deepest = len(c.channels) - 1
-        coarse = (-(-h // 2**deepest), -(-w // 2**deepest))
-        zeros = self.occupied.new_zeros
-        if c.wiring == "shared":
-            window = (zeros(batch, c.window, c.map_channels, h, w),)
-        else:
-            sizes = [(-(-h // 2**level), -(-w // 2**level)) for level in range(deepest + 1)]
-            window = tuple(
-                zeros(batch, c.window, k, *size) for k, size in zip(c.channels, sizes, strict=True)
-            )
+        c, zeros = self.config, self.occupied.new_zeros
+        coarse = self.level_size(len(c.channels) - 1)
+        kept = enumerate(self.encoder.kept_channels())
         return NetworkState(
             fresh=torch.ones(batch, dtype=torch.bool, device=self.occupied.device),
-            window=window,
+            window=tuple(zeros(batch, c.window, count, *self.level_size(level)) for level, count in kept),
             motion=zeros(batch, c.window * c.motion_embedding, c.channels[-1], *coarse),
-            offset=zeros(batch, 3, h, w),
+            offsets=zeros(batch, c.feedback, 3, *self.occupied.shape[2:]),
             memory=zeros(batch, c.memory, c.channels[-1], *coarse),
         )
 
@@ -94,87 +127,94 @@ class DualStreamNetwork(nn.Module):
         magnitude: Float[Tensor, "b 1 h w"],
         state: NetworkState,
         *,
-        streams: bool = True,
+        streams: Collection[Stream] = STREAMS,
     ) -> tuple[NetworkOutput, NetworkState]:
         """Advance every rollout by one frame.
 
         `maps` are the standardised position, velocity (and acceleration) maps of the newest frame,
-        `magnitude` its standardised motion magnitude V. With `streams` off the previous offset is
-        zero and the bank holds the current aggregate only (stage 1 of the paper).
+        `magnitude` its standardised motion magnitude V. Without the stream `geometric` previous offsets
+        count as zero, without `state` the bank holds the current aggregate only (stage 1 of the paper).
         """
-        feedback = state.offset / OFFSET_UNIT if streams else torch.zeros_like(state.offset)
-        frames, window = self._encode_window(maps, feedback, state)
-        deep, motion = frames[-1], state.motion
+        offsets = self.feedback(state.offsets, streams)
+        static = self.encoder.static()
+        kept = self.encoder.keep(self.fold(maps), offsets, static)
+        rings = [push(old, new, state.fresh) for old, new in zip(state.window, kept, strict=True)]
+        prepared = self.encoder.prepare([ring.flatten(0, 1) for ring in rings], static)
+        frames = [each.unflatten(0, rings[0].shape[:2]) for each in prepared]
+        window, motion = self.encoder.window(frames, offsets), state.motion
+        deep = window.frames[-1]
         if self.motion_embedding is not None:
-            coarse = nn.functional.adaptive_avg_pool2d(magnitude, (deep.shape[-2], deep.shape[-1]))
-            motion = push(motion, self.motion_embedding(coarse), state.fresh)
+            motion = push(motion, self.embed(magnitude), state.fresh)
             deep = deep + motion
-        aggregate = self.attention(deep[:, -1], deep)
+        asking = deep if self.config.readout == "mean" else deep[:, -1:]
+        places = Places.of(self, torch.arange(self.config.window, device=deep.device))
+        aggregate = self.aggregate(asking, *self.attention.project(deep), window, places)
         hidden, memory = aggregate, state.memory
         if self.bank is not None:
-            recalled = repeat_where(state.fresh, aggregate, memory)
-            if not streams:
-                recalled = aggregate[:, None].expand_as(memory)
-            hidden = self.bank(aggregate, recalled)
-            memory = push(recalled, hidden, state.fresh)
-
-        features = [mix(f) for mix, f in zip(self.mixing, frames[:-1], strict=True)] + [hidden]
-        raw = self.decoder(features)
-        offset = self._bounded(raw[:, :3]) * self.occupied
+            newest = deep[:, -1] if window.common is None else deep[:, -1] + window.common[-1]
+            first = aggregate if self.config.bank == "hidden" else newest
+            recalled = repeat_where(state.fresh, first, memory)
+            if "state" not in streams:
+                recalled = first[:, None].expand_as(memory)
+            attention = self.bank.attention
+            hidden = self.bank(aggregate, *attention.project(recalled), attention.ages())
+            memory = push(recalled, hidden if self.config.bank == "hidden" else newest, state.fresh)
+        output = self.decode(window, hidden, places)
         next_state = NetworkState(
             fresh=torch.zeros_like(state.fresh),
-            window=window,
+            window=tuple(rings),
             motion=motion,
-            offset=offset,
+            offsets=torch.cat([state.offsets, output.offset[:, None]], 1)[:, 1:],
             memory=memory,
         )
-        appearance = self.config.appearance_scale * raw[:, 3:]
-        return NetworkOutput(offset, appearance, tuple(features)), next_state
+        return output, next_state
 
-    def _bounded(self, raw: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
-        """Scale raw offsets to metres; a loose tanh guards long rollouts and costs nothing inside it."""
+    def fold(self, maps: Float[Tensor, "b c h w"]) -> Float[Tensor, "b d h2 w2"]:
+        """Move the pixels of each of the network's cells into channels."""
+        return nn.functional.pixel_unshuffle(maps, self.config.pixel_shuffle)
+
+    def feedback(
+        self, offsets: Float[Tensor, "b k 3 h w"], streams: Collection[Stream]
+    ) -> Float[Tensor, "b o h2 w2"]:
+        """Return the encoder's input of previous offsets, newest last; zero without the geometric stream."""
+        scaled = self.fold(offsets.flatten(1, 2) / OFFSET_UNIT).to(self.occupied.dtype)
+        return scaled if "geometric" in streams else torch.zeros_like(scaled)
+
+    def embed(self, magnitude: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b c h2 w2"]:
+        """Return the embedding of a motion magnitude at the deepest level."""
+        assert self.motion_embedding is not None
+        coarse = self.level_size(len(self.config.channels) - 1)
+        return self.motion_embedding(nn.functional.adaptive_avg_pool2d(magnitude, coarse))
+
+    def aggregate(
+        self,
+        asking: Float[Tensor, "b q c h w"],
+        keys: Float[Tensor, "b n c h w"],
+        values: Float[Tensor, "b n c h w"],
+        window: Window,
+        places: Places,
+    ) -> Float[Tensor, "b c h w"]:
+        """Return A: what the newest frame finds in the window, or the mean of what every frame finds.
+
+        `asking` is the newest frame, or all of them in the order of the keys.
+        """
+        everyone = self.config.readout == "mean"
+        common = None if window.common is None else window.common[-1]
+        if common is not None:
+            asking = asking + common[:, None]
+        age = places.age if everyone else self.attention.age[-1:]
+        younger = places.younger if everyone and self.config.causal else None
+        asking = asking + age[:, :, None, None]
+        found = self.attention.attend(asking, keys, values, places.ages, common=common, younger=younger)
+        return found.mean(1)
+
+    def decode(self, window: Window, hidden: Float[Tensor, "b c h w"], places: Places) -> NetworkOutput:
+        """Return the residual maps of the newest frame."""
+        shared = window.common or (None,) * len(window.frames)
+        shallow = zip(self.mixing, window.frames, shared, places.weights, strict=False)
+        features = [mix(frames, common, weights) for mix, frames, common, weights in shallow] + [hidden]
+        raw = nn.functional.pixel_shuffle(self.decoder(features), self.config.pixel_shuffle)
         limit = self.config.offset_limit
-        return limit * torch.tanh(raw * (self.config.offset_scale / limit))
-
-    def _encode_window(
-        self, maps: Tensor, feedback: Tensor, state: NetworkState
-    ) -> tuple[list[Float[Tensor, "b n _ _ _"]], tuple[Tensor, ...]]:
-        """Return per-level encodings of the window, oldest frame first, and the window to keep."""
-        if self.config.wiring == "perframe":
-            encoded = self._encode(maps, feedback)
-            frames = [push(old, new, state.fresh) for old, new in zip(state.window, encoded, strict=True)]
-            return frames, tuple(frames)
-        inputs = push(state.window[0], maps, state.fresh)
-        n = inputs.shape[1]
-        encoded = self._encode(inputs.flatten(0, 1), feedback.repeat_interleave(n, 0))
-        return [f.reshape(-1, n, *f.shape[1:]) for f in encoded], (inputs,)
-
-    def _encode(self, maps: Tensor, feedback: Tensor) -> list[Float[Tensor, "b _ _ _"]]:
-        """Return the feature pyramid of frames, finest level first (paper equations 4-5)."""
-        parts = [maps, self.identity.expand(len(maps), -1, -1, -1)]
-        if self.config.feedback:
-            parts.append(feedback)
-        x = channels_last(torch.cat(parts, 1))
-        features = []
-        for block in self.encoder:
-            x = block(x)
-            features.append(x)
-        return features
-
-
-def repeat_where(
-    fresh: Bool[Tensor, " b"], newest: Float[Tensor, "b *s"], ring: Float[Tensor, "b n *s"]
-) -> Float[Tensor, "b n *s"]:
-    """Return the ring, or copies of the newest entry for rollouts that have no history yet."""
-    if not fresh.any():
-        return ring
-    mask = fresh.reshape(-1, *[1] * (ring.ndim - 1))
-    return torch.where(mask, newest[:, None], ring)
-
-
-def push(
-    ring: Float[Tensor, "b n *s"], newest: Float[Tensor, "b *s"], fresh: Bool[Tensor, " b"]
-) -> Float[Tensor, "b n *s"]:
-    """Drop the oldest entry of a ring and append the newest; without history it fills the ring."""
-    history = repeat_where(fresh, newest, ring)
-    return torch.cat([history[:, 1:], newest[:, None]], 1)
+        # A loose tanh guards long rollouts and costs nothing inside its limit.
+        offset = limit * torch.tanh(raw[:, :3] * (self.config.offset_scale / limit)) * self.occupied
+        return NetworkOutput(offset, self.config.appearance_scale * raw[:, 3:], tuple(features))

@@ -20,11 +20,11 @@ class NetworkState:
     fresh: Bool[Tensor, " b"]
     """Rollouts that have not seen a frame yet."""
     window: tuple[Float[Tensor, "b n ..."], ...]
-    """Per level, oldest first: encodings (wiring `perframe`) or inputs (`shared`) of the last n frames."""
-    motion: Float[Tensor, "b n c hL wL"]
+    """What the last n frames left behind, oldest first: features by level, or input maps (see `encoder`)."""
+    motion: Float[Tensor, "b _ c hL wL"]
     """Embedded motion magnitudes m of the last n frames at the coarsest level, oldest first."""
-    offset: Float[Tensor, "b 3 h w"]
-    """Geometric stream: the previous frame's offset map, metres."""
+    offsets: Float[Tensor, "b k 3 h w"]
+    """Geometric stream: the offset maps of the last k frames (the paper: 1), metres, oldest first."""
     memory: Float[Tensor, "b m c hL wL"]
     """State stream: the bank of the last m hidden states h, oldest first."""
 
@@ -46,5 +46,23 @@ class NetworkState:
         return dataclasses.replace(
             self,
             fresh=self.fresh | rollouts,
-            offset=torch.where(rollouts[:, None, None, None], 0.0, self.offset),
+            offsets=torch.where(rollouts[:, None, None, None, None], 0.0, self.offsets),
         )
+
+
+def repeat_where(
+    fresh: Bool[Tensor, " b"], newest: Float[Tensor, "b *s"], ring: Float[Tensor, "b n *s"]
+) -> Float[Tensor, "b n *s"]:
+    """Return the ring, or copies of the newest entry for rollouts that have no history yet."""
+    if not fresh.any():
+        return ring
+    mask = fresh.reshape(-1, *[1] * (ring.ndim - 1))
+    return torch.where(mask, newest[:, None], ring)
+
+
+def push(
+    ring: Float[Tensor, "b n *s"], newest: Float[Tensor, "b *s"], fresh: Bool[Tensor, " b"]
+) -> Float[Tensor, "b n *s"]:
+    """Drop the oldest entry of a ring and append the newest; without history it fills the ring."""
+    history = repeat_where(fresh, newest, ring)
+    return torch.cat([history[:, 1:], newest[:, None]], 1)

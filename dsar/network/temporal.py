@@ -1,10 +1,16 @@
-"""Motion-adaptive temporal aggregation and the memory bank (paper section 3.3 and 3.4)."""
+"""Motion-adaptive temporal aggregation and the memory bank (paper sections 3.3 and 3.4).
+
+Frames come oldest first, or in any other `order`: then entry i is the frame of age order[i], 0 the oldest,
+n - 1 the newest.
+"""
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 
 from dsar.network.layers import ConvBlock, conv, projection
+
+Order = Int64[Tensor, " n"] | None
 
 
 class MotionEmbedding(nn.Module):
@@ -21,10 +27,10 @@ class MotionEmbedding(nn.Module):
 
 
 class TemporalAttention(nn.Module):
-    """Multi-head attention of one query frame over a sequence of frames, at each pixel by itself.
+    """Multi-head attention of frames to frames, at each pixel by itself (paper equations 9-12).
 
-    The paper masks an n x n self-attention causally and reads its last row (equations 9-11); the
-    last row sees every frame, so a single query is the same function at 1/n of the cost.
+    A learnt embedding of a frame's age is part of what its key and value are made of. Both are linear, so
+    they can be projected once and given their ages as they grow older.
     """
 
     def __init__(self, channels: int, heads: int, length: int) -> None:
@@ -36,20 +42,50 @@ class TemporalAttention(nn.Module):
         self.out = projection(channels, channels)
         self.age = nn.Parameter(0.02 * torch.randn(length, channels))
 
-    def forward(
-        self, query: Float[Tensor, "b c h w"], frames: Float[Tensor, "b n c h w"]
-    ) -> Float[Tensor, "b c h w"]:
-        """Return the attended mixture of frames, oldest first, for the query frame.
+    def project(
+        self, frames: Float[Tensor, "b n c h w"]
+    ) -> tuple[Float[Tensor, "b n c h w"], Float[Tensor, "b n c h w"]]:
+        """Return keys and values of frames, without their ages."""
+        flat = frames.flatten(0, 1)
+        return (
+            self.key(flat).unflatten(0, frames.shape[:2]),
+            self.value(flat).unflatten(0, frames.shape[:2]),
+        )
 
-        A learnt embedding of each frame's age is added before the keys and values are formed.
+    def ages(self, order: Order = None) -> Float[Tensor, "2 n c"]:
+        """Return what their ages add to the keys and to the values of frames."""
+        ages = self.age if order is None else self.age[order]
+        return torch.stack([ages @ layer.weight[:, :, 0, 0].mT for layer in (self.key, self.value)])
+
+    def attend(
+        self,
+        queries: Float[Tensor, "b q c h w"],
+        keys: Float[Tensor, "b n c h w"],
+        values: Float[Tensor, "b n c h w"],
+        ages: Float[Tensor, "2 n c"],
+        *,
+        common: Float[Tensor, "b c h w"] | None = None,
+        younger: Bool[Tensor, "q n"] | None = None,
+    ) -> Float[Tensor, "b q c h w"]:
+        """Return what each query finds among frames given by `project` and `ages`.
+
+        `common` was to be added to every frame before they were projected. What is `younger` than a query is
+        hidden from it.
         """
-        b, n, c, h, w = frames.shape
-        tokens = (frames + self.age[:, :, None, None]).flatten(0, 1)
-        keys = self.key(tokens).reshape(b, n, self.heads, c // self.heads, h, w)
-        values = self.value(tokens).reshape(b, n, self.heads, c // self.heads, h, w)
-        queries = self.query(query).reshape(b, 1, self.heads, c // self.heads, h, w)
-        scores = (queries * keys).sum(3, keepdim=True) * (c // self.heads) ** -0.5
-        return self.out((scores.softmax(1) * values).sum(1).reshape(b, c, h, w))
+        b, q, c, h, w = queries.shape
+        late = ages[:, None, :, :, None, None]
+        if common is not None:
+            layers = (self.key, self.value)
+            late = late + torch.stack([nn.functional.conv2d(common, x.weight) for x in layers])[:, :, None]
+        keys, values = keys + late[0], values + late[1]
+        split = (self.heads, c // self.heads, h, w)
+        asked = self.query(queries.flatten(0, 1)).reshape(b, q, 1, *split)
+        keys, values = (x.reshape(b, 1, -1, *split) for x in (keys, values))
+        scores = (asked * keys).sum(4, keepdim=True) * (c // self.heads) ** -0.5
+        if younger is not None:
+            scores = scores.masked_fill(younger[:, :, None, None, None, None], -torch.inf)
+        mixed = (scores.softmax(2) * values).sum(2).reshape(b * q, c, h, w)
+        return self.out(mixed).unflatten(0, (b, q))
 
 
 class MemoryBank(nn.Module):
@@ -61,11 +97,19 @@ class MemoryBank(nn.Module):
         self.recall_logit = nn.Parameter(torch.tensor(recall).logit())
 
     def forward(
-        self, aggregate: Float[Tensor, "b c h w"], memory: Float[Tensor, "b m c h w"]
+        self,
+        aggregate: Float[Tensor, "b c h w"],
+        keys: Float[Tensor, "b m c h w"],
+        values: Float[Tensor, "b m c h w"],
+        ages: Float[Tensor, "2 m c"],
     ) -> Float[Tensor, "b c h w"]:
-        """Return h = (1 - lambda) A + lambda CrossAttn(A, M), lambda = sigmoid(recall_logit)."""
+        """Return h = (1 - lambda) A + lambda CrossAttn(A, M), lambda = sigmoid(recall_logit).
+
+        Keys, values and `ages` are the attention's own projections of the bank.
+        """
         recall = self.recall_logit.sigmoid()
-        return (1 - recall) * aggregate + recall * self.attention(aggregate, memory)
+        recalled = self.attention.attend(aggregate[:, None], keys, values, ages)[:, 0]
+        return (1 - recall) * aggregate + recall * recalled
 
 
 class TemporalMixing(nn.Module):
@@ -79,6 +123,18 @@ class TemporalMixing(nn.Module):
         self.weights = nn.Parameter(weights)
         self.mix = projection(channels, channels)
 
-    def forward(self, frames: Float[Tensor, "b n c h w"]) -> Float[Tensor, "b c h w"]:
-        """Return the mixture of n frames, oldest first."""
-        return self.mix((frames * self.weights[:, :, None, None]).sum(1))
+    def forward(
+        self,
+        frames: Float[Tensor, "b n c h w"],
+        common: Float[Tensor, "b c h w"] | None = None,
+        weights: Float[Tensor, "n c"] | None = None,
+    ) -> Float[Tensor, "b c h w"]:
+        """Return the mixture of n frames, to each of which `common` is added first.
+
+        `weights` are those of the frames, where these are not the oldest first.
+        """
+        weights = self.weights if weights is None else weights
+        mixed = (frames * weights[:, :, None, None]).sum(1)
+        if common is not None:
+            mixed = mixed + common * weights.sum(0)[:, None, None]
+        return self.mix(mixed)

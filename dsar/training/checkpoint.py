@@ -28,7 +28,7 @@ from dsar.body.model import PARENTS, Body
 from dsar.config import TrainConfig, config_from_json
 from dsar.errors import CheckpointError, ConfigError
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 _BODY = ("vertices", "faces", "joints", "weights", "uv", "uv_faces")
 
 

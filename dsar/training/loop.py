@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import logging
 import math
 import shutil
 import signal
@@ -23,6 +24,7 @@ from dsar.data.capture import open_capture
 from dsar.errors import CaptureError, CheckpointError, ConfigError, TrainingError
 from dsar.training import checkpoint as ckpt
 from dsar.training import workers
+from dsar.training.budget import check_budget
 from dsar.training.checkpoint import Run
 from dsar.training.lpips import load_lpips
 from dsar.training.muon import Muon
@@ -31,12 +33,16 @@ from dsar.training.segment import Progress, SegmentTrainer
 from dsar.training.stages import Position, position
 from dsar.types import Capture
 
+_log = logging.getLogger(__name__)
 REPORT_EVERY = 20
 """Updates between lines of metrics.jsonl."""
 SAVE_EVERY = 200
 """Updates between checkpoints (not seconds: all workers must agree)."""
 STILL_FRAMES = 48
 """Near-rest frames that the template is fitted to."""
+PROBE_EVERY = 100
+"""Updates between comparisons of the losses' gradients, each of which costs as much as some updates."""
+_LEAST_SHARE, _LARGEST_SHARE = 1e-4, 1.0
 _TEMPLATE_RATES = {
     "means": 1e-3,
     "quaternions": 5e-3,
@@ -64,6 +70,8 @@ class Report:
     """Smoothed PSNR of training crops, dB."""
     seconds: float
     """Seconds since the first update of this process."""
+    gradients: dict[str, float] | None = None
+    """Each regulariser's gradient as a share of the images', when they were last compared."""
 
 
 Reporter = Callable[[Report], None]
@@ -79,7 +87,8 @@ def train(config: TrainConfig, run: Run, *, resume: bool = False, report: Report
             TrainingError when a value stops being finite.
     """
     config.validate()
-    open_capture(config.capture)
+    check_budget(config)
+    open_capture(config.capture).with_cameras(config.cameras)
     if run.exists and not resume:
         raise CheckpointError(f"{run.folder} holds a run already; go on with --resume, or give another --out")
     if resume and not run.exists:
@@ -108,7 +117,7 @@ def check_same_settings(config: TrainConfig, saved: TrainConfig, run: Run) -> No
 def _train(config: TrainConfig, folder: Path, resume: bool, report: Reporter | None) -> None:
     torch.manual_seed(config.seed)
     run = Run(folder)
-    capture = open_capture(config.capture)
+    capture = open_capture(config.capture).with_cameras(config.cameras)
     if resume:
         avatar, _, _ = ckpt.load_checkpoint(run)
     else:
@@ -131,6 +140,7 @@ def _train(config: TrainConfig, folder: Path, resume: bool, report: Reporter | N
         trainer.registered = registration.result
     clock, used, stop = Clock(schedule.minutes), 0.0, False
     smoothed: Progress | None = None
+    warned: set[str] = set()
     with _stop_signals() as received:
         while progress < 1:
             if stop:
@@ -147,6 +157,7 @@ def _train(config: TrainConfig, folder: Path, resume: bool, report: Reporter | N
             rng = np.random.default_rng([config.seed, workers.rank(), step])
             gradients.clear()
             done = _segment(trainer, still, rng, now, step)
+            _warn_of_gradients(done, warned)
             before, (stop, used) = used, gradients.average(bool(received), clock.used())
             if not gradients.buffer.isfinite().all():
                 raise TrainingError(f"step {step}: the gradient of {bad_gradient(avatar)} is not finite")
@@ -201,7 +212,7 @@ def _segment(
             return trainer.template_segment(rng, still, now.reduction)
         if now.stage == "imitation":
             return trainer.imitation_segment(rng)
-        return trainer.segment(rng, now)
+        return trainer.segment(rng, now, probe=workers.rank() == 0 and step % PROBE_EVERY == 0)
     except TrainingError as error:
         raise TrainingError(f"step {step} ({now.stage}): {error}") from error
 
@@ -328,7 +339,17 @@ def _smooth(before: Progress | None, now: Progress) -> Progress:
     mse = now.mse if before.mse is None else before.mse
     if now.mse is not None and before.mse is not None:
         mse = 0.95 * before.mse + 0.05 * now.mse
-    return Progress(0.95 * before.loss + 0.05 * now.loss, mse)
+    gradients = before.gradients if now.gradients is None else now.gradients
+    return Progress(0.95 * before.loss + 0.05 * now.loss, mse, gradients)
+
+
+def _warn_of_gradients(done: Progress, warned: set[str]) -> None:
+    """Say once of each regulariser that it moves nothing, or more than the images do."""
+    for name, share in (done.gradients or {}).items():
+        if name not in warned and not (share == 0 or _LEAST_SHARE <= share <= _LARGEST_SHARE):
+            warned.add(name)
+            effect = "moves almost nothing" if share < 1 else "outweighs the images"
+            _log.warning("Loss %s %s: its gradient is %.2g times theirs", name, effect, share)
 
 
 def _psnr(mse: float | None) -> float:
@@ -346,7 +367,9 @@ def _report(
     reporter: Reporter | None,
 ) -> None:
     psnr = _psnr(smoothed.mse)
-    line = Report(step, config.schedule.steps, progress, now.stage, smoothed.loss, psnr, seconds)
+    line = Report(
+        step, config.schedule.steps, progress, now.stage, smoothed.loss, psnr, seconds, smoothed.gradients
+    )
     with run.metrics.open("a") as file:
         file.write(json.dumps(dataclasses.asdict(line)) + "\n")
     if reporter is not None:

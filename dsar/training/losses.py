@@ -132,44 +132,47 @@ class TemporalRecord:
         return TemporalRecord(output, self.posed.detach(), self.speed)
 
 
-def temporal_loss(
+def temporal_losses(
     records: list[TemporalRecord],
     ages: list[int],
     occupied: Float[Tensor, "1 1 h w"],
     cells: Int64[Tensor, " p"],
     config: LossConfig,
-) -> Float[Tensor, ""]:
-    """Return the weighted temporal losses of the newest record against the one or two before it.
+) -> dict[str, Float[Tensor, ""]]:
+    """Return the weighted temporal losses of the newest record against the one or two before it, by name.
 
     `ages` counts the frames that each rollout has seen before the newest: rollouts without enough
-    past are left out. The adaptive weight is exp(-V / tau_reg) with V the largest of the recorded
-    frames, since V alone falls to zero at a stop, exactly when the cloth swings most.
+    past are left out. The adaptive weight is exp(-V / tau_reg).
     """
-    newest = records[-1]
-    total = newest.posed.new_zeros(())
+    newest, losses = records[-1], {}
     if len(records) < 2:
-        return total
+        return losses
     speed = torch.stack([record.speed for record in records]).amax(0)
-    weight = torch.exp(-speed * FPS / config.still_speed) * occupied
+    if config.magnitude == "frame":
+        speed = newest.speed
+    weight = torch.exp(-speed * FPS / config.still_speed) if config.adaptive else torch.ones_like(speed)
+    weight = weight * occupied
     one, two = (newest.posed.new_tensor([float(age >= past) for age in ages]) for past in (1, 2))
-    previous = records[-2]
-    total = total + config.prediction * _prediction(newest.output, previous.output, weight, one)
-    features = zip(newest.output.features, previous.output.features, strict=True)
-    for current, past in features:
-        total = total + config.feature * _GAMMA * ((current - past).square().mean((1, 2, 3)) * one).mean()
+    previous, scale = records[-2], config.temporal_scale
+
+    def over_rollouts(values: Float[Tensor, "b ..."], valid: Float[Tensor, " b"]) -> Float[Tensor, ""]:
+        flat = values.flatten(1)
+        return ((flat.mean(1) if config.reduction == "mean" else flat.sum(1)) * valid).mean()
+
+    change = _change(newest.output, previous.output)
+    losses["prediction"] = scale * config.prediction * over_rollouts(weight * change, one)
+    pairs = zip(newest.output.features, previous.output.features, strict=True)
+    apart = torch.stack([over_rollouts((current - past).square(), one) for current, past in pairs])
+    losses["feature"] = scale * config.feature * _GAMMA * apart.sum()
     if len(records) > 2:
         acceleration = (newest.posed - 2 * previous.posed + records[-3].posed) * _CENTIMETRES
-        at_cells = weight.flatten(1)[:, cells]
-        jolt = (at_cells * acceleration.square().sum(-1)).mean(1)
-        total = total + config.smoothness * (jolt * two).mean()
-    return config.temporal_scale * total
+        jolt = weight.flatten(1)[:, cells] * acceleration.square().sum(-1)
+        losses["smoothness"] = scale * config.smoothness * over_rollouts(jolt, two)
+    return losses
 
 
-def _prediction(
-    current: NetworkOutput, past: NetworkOutput, weight: Float[Tensor, "b 1 h w"], valid: Float[Tensor, " b"]
-) -> Float[Tensor, ""]:
-    """Return L_pred (equation 19): change of offset (cm), quaternion and log-scale between frames."""
+def _change(current: NetworkOutput, past: NetworkOutput) -> Float[Tensor, "b 1 h w"]:
+    """Return the squared change of offset (cm), quaternion and log-scale between frames (equation 19)."""
     moved = (current.offset - past.offset) * _CENTIMETRES
     turned = current.appearance[:, :7] - past.appearance[:, :7]
-    change = moved.square().sum(1, keepdim=True) + turned.square().sum(1, keepdim=True)
-    return ((weight * change).mean((1, 2, 3)) * valid).mean()
+    return moved.square().sum(1, keepdim=True) + turned.square().sum(1, keepdim=True)

@@ -1,8 +1,8 @@
 """One update's worth of work: a segment of K frames of several rollouts, rendered and compared."""
 
 import dataclasses
-from collections import deque
-from collections.abc import Mapping
+from collections import defaultdict, deque
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,12 +15,12 @@ from dsar.avatar.mirror import Mirror, mirror_motion
 from dsar.avatar.track import contexts
 from dsar.config import TrainConfig
 from dsar.errors import TrainingError
-from dsar.network import NetworkOutput, NetworkState
+from dsar.network import STREAMS, NetworkOutput, NetworkState, Stream
 from dsar.network.maps import FrameMaps
 from dsar.raster import rasterize, reduced_dilation
-from dsar.training.losses import TemporalRecord, image_loss, registered_loss, spatial_loss, temporal_loss
+from dsar.training.losses import TemporalRecord, image_loss, registered_loss, spatial_loss, temporal_losses
 from dsar.training.stages import WHOLE_CLIP, Position
-from dsar.training.streams import Stream, Streams
+from dsar.training.streams import Place, Streams
 from dsar.training.targets import load_target
 from dsar.types import Capture, Gaussians
 
@@ -37,13 +37,15 @@ class Progress:
     """Total loss per rendered view."""
     mse: float | None
     """Mean squared colour error per view, over the crop and a random background; None without images."""
+    gradients: dict[str, float] | None = None
+    """Norm of each regulariser's gradient by the decoder's head as a share of L_render's, where asked for."""
 
 
 @dataclass(frozen=True)
 class _Step:
     """One frame of every rollout."""
 
-    places: list[Stream]
+    places: list[Place]
     """Where each rollout stands."""
     context: Float[Tensor, "b t j 4 4"]
     """Each one's motion, as it was filmed."""
@@ -99,16 +101,21 @@ class SegmentTrainer:
         self.avatar.reveal()
         loss = torch.zeros(())
         for _ in range(self.config.schedule.segment):
-            step = self._step(rng, WHOLE_CLIP, streams=True)
+            step = self._step(rng, WHOLE_CLIP, streams=STREAMS)
             loss = loss + self._registered(step)
         self._cut()
         return self._finish(loss, None, self.config.schedule.segment)
 
-    def segment(self, rng: np.random.Generator, position: Position) -> Progress:
-        """Advance every rollout by K frames and back-propagate through them, the whole body shown."""
+    def segment(self, rng: np.random.Generator, position: Position, *, probe: bool = False) -> Progress:
+        """Advance every rollout by K frames and back-propagate through them, the whole body shown.
+
+        With `probe`, report how the gradients of the losses compare.
+        """
         self.avatar.reveal()
-        schedule, streams = self.config.schedule, position.stage == "autoregressive"
-        loss, mse, count = torch.zeros(()), torch.zeros(()), 0
+        schedule = self.config.schedule
+        streams = STREAMS if position.stage == "autoregressive" else ()
+        losses: dict[str, Tensor] = defaultdict(lambda: torch.zeros(()))
+        mse, count = torch.zeros(()), 0
         for _ in range(schedule.segment):
             step = self._step(rng, position.horizon, streams=streams)
             shown = [i for i in range(len(step.places)) if rng.random() < schedule.rendered]
@@ -116,17 +123,21 @@ class SegmentTrainer:
             gaussians = self.avatar.gaussians(step.context[shown], answers) if shown else []
             for place, each in zip((step.places[i] for i in shown), gaussians, strict=True):
                 view = self._views(rng, each, place.sequence, place.frame, position.reduction)
-                loss, mse, count = loss + view[0], mse + view[1], count + schedule.views
-            regularisers = self._spatial(step.output)
+                losses["render"] = losses["render"] + view[0]
+                mse, count = mse + view[1], count + schedule.views
+            regularisers = {"spatial": self._spatial(step.output)}
             if self.registered:
-                regularisers = regularisers + self.config.loss.registered * self._registered(step)
+                regularisers["registered"] = self.config.loss.registered * self._registered(step)
             if streams:
-                regularisers = regularisers + self._temporal(step)
-            loss = loss + regularisers * len(shown) * schedule.views
+                regularisers |= self._temporal(step)
+            for name, loss in regularisers.items():
+                losses[name] = losses[name] + loss * len(shown) * schedule.views
         self._cut()
-        return self._finish(loss, mse, max(count, 1))
+        gradients = self._compare_gradients(losses) if probe else None
+        done = self._finish(torch.stack(list(losses.values())).sum(), mse, max(count, 1))
+        return dataclasses.replace(done, gradients=gradients)
 
-    def _step(self, rng: np.random.Generator, horizon: int, *, streams: bool) -> "_Step":
+    def _step(self, rng: np.random.Generator, horizon: int, *, streams: Collection[Stream]) -> "_Step":
         """Advance every rollout by one frame."""
         places, fresh = self.streams.next_frames(rng, horizon)
         self.state = self.state.restart(torch.tensor(fresh))
@@ -151,7 +162,7 @@ class SegmentTrainer:
     def carried(self) -> tuple[dict[str, Tensor], list[dict[str, str | int]]]:
         """Return what must survive a restart: the rollouts' state as tensors, and their places."""
         tensors = {"fresh": self.state.fresh, "motion": self.state.motion}
-        tensors |= {"offset": self.state.offset, "memory": self.state.memory}
+        tensors |= {"offsets": self.state.offsets, "memory": self.state.memory}
         tensors |= {f"window.{i}": level for i, level in enumerate(self.state.window)}
         for i, record in enumerate(self.records):
             tensors |= {f"record.{i}.offset": record.output.offset, f"record.{i}.posed": record.posed}
@@ -167,7 +178,7 @@ class SegmentTrainer:
             fresh=tensors["fresh"],
             window=tuple(tensors[f"window.{i}"] for i in range(levels)),
             motion=tensors["motion"],
-            offset=tensors["offset"],
+            offsets=tensors["offsets"],
             memory=tensors["memory"],
         )
         self.records.clear()
@@ -179,7 +190,7 @@ class SegmentTrainer:
                 TemporalRecord(output, tensors[f"{prefix}.posed"], tensors[f"{prefix}.speed"])
             )
         if places:
-            self.streams.streams[:] = [Stream(**place) for place in places]  # pyright: ignore[reportArgumentType]
+            self.streams.streams[:] = [Place(**place) for place in places]  # pyright: ignore[reportArgumentType]
 
     def _views(
         self, rng: np.random.Generator, gaussians: Gaussians, sequence: str, frame: int, reduction: int
@@ -209,13 +220,23 @@ class SegmentTrainer:
         distances = registered_loss(step.answer.offset, torch.stack(maps), self.avatar.cells)
         return (distances * torch.tensor(known)).mean()
 
-    def _temporal(self, step: "_Step") -> Tensor:
+    def _compare_gradients(self, losses: Mapping[str, Tensor]) -> dict[str, float] | None:
+        head, norms = self.avatar.network.decoder.head.weight, {}
+        for name, loss in losses.items():
+            # A loss that is switched off, or of frames without a past, is a constant.
+            if loss.requires_grad:
+                (gradient,) = torch.autograd.grad(loss, head, retain_graph=True, materialize_grads=True)
+                norms[name] = float(gradient.norm())
+        render = norms.pop("render", 0.0)
+        return {name: norm / render for name, norm in norms.items()} if render else None
+
+    def _temporal(self, step: "_Step") -> dict[str, Tensor]:
         """Append this frame's record and return the temporal losses against the frames before it."""
         avatar = self.avatar
         posed = avatar.deformed_control_points(step.seen, step.output)
         self.records.append(TemporalRecord(step.output, posed, step.observed.speed))
         ages = [place.age for place in step.places]
-        return temporal_loss(
+        return temporal_losses(
             list(self.records), ages, avatar.network.occupied, avatar.cells, self.config.loss
         )
 

@@ -7,7 +7,7 @@ import numpy as np
 
 
 @dataclass
-class Stream:
+class Place:
     """One rollout's place."""
 
     sequence: str
@@ -25,9 +25,9 @@ class Streams:
 
     def __init__(self, clips: Mapping[str, range], count: int, mirrored: float = 0.0) -> None:
         self.clips, self.mirrored = dict(clips), mirrored
-        self.streams: list[Stream | None] = [None] * count
+        self.streams: list[Place | None] = [None] * count
 
-    def next_frames(self, rng: np.random.Generator, horizon: int) -> tuple[list[Stream], list[bool]]:
+    def next_frames(self, rng: np.random.Generator, horizon: int) -> tuple[list[Place], list[bool]]:
         """Return where each rollout stands, and which of them start afresh with this frame.
 
         A rollout restarts at the end of its clip or after `horizon` frames: in the middle of a clip
@@ -48,11 +48,11 @@ class Streams:
             if stream is not None:
                 stream.frame, stream.age = stream.frame + 1, stream.age + 1
 
-    def _restart(self, rng: np.random.Generator, horizon: int, *, anywhere: bool) -> Stream:
+    def _restart(self, rng: np.random.Generator, horizon: int, *, anywhere: bool) -> Place:
         names = list(self.clips)
         lengths = np.array([len(self.clips[name]) for name in names], float)
         name = names[rng.choice(len(names), p=lengths / lengths.sum())]
         clip = self.clips[name]
         latest = clip.stop - (1 if anywhere else horizon)
         start = int(rng.integers(clip.start, latest + 1)) if latest > clip.start else clip.start
-        return Stream(name, start, 0, bool(rng.random() < self.mirrored))
+        return Place(name, start, 0, bool(rng.random() < self.mirrored))

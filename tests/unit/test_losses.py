@@ -15,7 +15,7 @@ from dsar.training.losses import (
     registered_loss,
     spatial_loss,
     ssim,
-    temporal_loss,
+    temporal_losses,
 )
 
 
@@ -62,7 +62,8 @@ def loss(records, ages, **weights):
     config = LossConfig(
         **({"feature": 0.0, "prediction": 0.0, "smoothness": 0.0, "temporal_scale": 1.0} | weights)
     )
-    return float(temporal_loss(records, ages, torch.ones(1, 1, 2, 2), torch.arange(4), config))
+    terms = temporal_losses(records, ages, torch.ones(1, 1, 2, 2), torch.arange(4), config)
+    return float(sum(terms.values()))
 
 
 def test_spatial_loss_counts_a_centimetre_between_neighbours_as_one():
@@ -105,6 +106,23 @@ def test_motion_anywhere_in_the_record_loosens_the_weight():
     after_a_stop = loss([record(still, speed=0.01), record(moved)], [5], prediction=1.0)
     # 0.01 m a frame at 30 fps is 0.3 m/s: the weight's 1/e point.
     assert abs(after_a_stop / rest - np.exp(-1)) < 1e-5
+    paper = loss([record(still, speed=0.01), record(moved)], [5], prediction=1.0, magnitude="frame")
+    assert paper == rest
+
+
+def test_without_adaptation_motion_does_not_matter():
+    still, moved = torch.zeros(1, 3, 2, 2), torch.full((1, 3, 2, 2), 0.01)
+    fast = [record(still, speed=0.5), record(moved, speed=0.5)]
+    assert abs(loss(fast, [5], prediction=1.0, adaptive=False) - 3.0) < 1e-5
+    assert loss(fast, [5], prediction=1.0) < 1e-5
+
+
+def test_sums_are_means_times_the_number_of_elements():
+    still, moved = torch.zeros(2, 3, 2, 2), torch.full((2, 3, 2, 2), 0.01)
+    records = [record(still), record(moved, feature=0.1, posed=0.02), record(still, posed=0.5)]
+    for name, count in (("prediction", 4), ("feature", 3 * 4), ("smoothness", 4)):
+        mean, total = (loss(records, [5, 5], **{name: 1.0}, reduction=how) for how in ("mean", "sum"))
+        assert abs(total - count * mean) < 1e-4 * total, name
 
 
 @pytest.mark.parametrize("size", [(37, 22), (64, 48), (7, 5)])

@@ -15,7 +15,7 @@ from dsar.body.files import load_body
 from dsar.body.skinning import forward_kinematics
 from dsar.data.capture import EMBEDDED_CAPTURE, open_capture
 from dsar.data.motion import write_motion
-from dsar.errors import CaptureError
+from dsar.errors import CaptureError, ConfigError
 from dsar.geometry.cameras import look_at, project
 from dsar.types import Motion
 
@@ -243,3 +243,18 @@ def test_embedded_garment_projects_into_the_masks(embedded):
             column, row = pixels.floor().long().T.numpy()
             # Millimetre truth against masks of 8 mm pixels: the hem may round over an edge.
             assert (alpha[row, column] > 0).mean() > 0.98
+
+
+def test_some_cameras_are_spread_out_and_show_what_they_showed(tiny_capture):
+    whole = open_capture(tiny_capture)
+    half = whole.with_cameras(2)
+    centers = [-c.T_camera_world[:3, :3].T @ c.T_camera_world[:3, 3] for c in whole.cameras]
+    names = [camera.name for camera in half.cameras]
+    farthest = max(range(len(centers)), key=lambda i: float((centers[i] - centers[0]).norm()))
+    assert names == sorted({whole.cameras[0].name, whole.cameras[farthest].name}, key=names.index)
+    sequence = next(iter(whole.motions))
+    index = [camera.name for camera in whole.cameras].index(names[1])
+    assert np.array_equal(half.image(sequence, 0, 1), whole.image(sequence, 0, index))
+    assert whole.with_cameras(None) is whole
+    with pytest.raises(ConfigError, match="cameras is 99"):
+        whole.with_cameras(99)

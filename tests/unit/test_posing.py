@@ -4,19 +4,21 @@ import pytest
 import torch
 
 from dsar.avatar.fused import bilinear_taps, pose_fused, sample
-from dsar.avatar.posing import nearest_quaternions, pose_gaussians
+from dsar.avatar.posing import _nearest_quaternions_plain, nearest_quaternions, pose_gaussians
 from dsar.avatar.template import GaussianParameters
 from dsar.geometry.rotations import matrix_from_axis_angle, matrix_from_quaternion, nearest_rotation
 
 
-def test_kernel_finds_the_polar_factor_of_blended_bones():
+@pytest.mark.parametrize("find", [nearest_quaternions, _nearest_quaternions_plain])
+def test_the_polar_factor_of_blended_bones_is_found(find):
     generator = torch.Generator().manual_seed(0)
     turns = matrix_from_axis_angle(torch.randn(3, 500, 2, 3, generator=generator))
     share = torch.rand(3, 500, 1, 1, generator=generator)
     blended = share * turns[:, :, 0] + (1 - share) * turns[:, :, 1]
     # Opposite bones blend to nothing; such matrices have no nearest rotation to speak of.
     sane = torch.linalg.det(blended) > 0.05
-    fast = matrix_from_quaternion(nearest_quaternions(blended).double())
+    matrices = blended if find is nearest_quaternions else blended.reshape(-1, 9)
+    fast = matrix_from_quaternion(find(matrices).double()).reshape(blended.shape)
     exact = nearest_rotation(blended.double())
     assert sane.float().mean() > 0.5
     assert (fast - exact)[sane].abs().max() < 1e-5

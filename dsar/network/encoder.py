@@ -1,0 +1,195 @@
+"""Input maps and previous offsets to the features of a window (paper equations 4-5), in three wirings.
+
+They differ in which offsets a frame of the window is given, and so in what it leaves to later steps:
+
+* `SharedWiring` (the paper's): every frame is given the newest offsets, so all n are encoded at each step.
+* `PerFrameWiring`: a frame is given the offsets that preceded it, and its features never change.
+* `LateWiring`: poses and the newest offsets have encoders of their own, whose features are added; a pose's
+  never change.
+
+A wiring works in three steps, so that rollouts can keep what does not change: `keep` says what the newest
+frame leaves behind, `prepare` computes what follows from that alone, `window` the rest.
+"""
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from dsar.config import ModelConfig
+from dsar.network.layers import SLOPE, ConvBlock, channels_last, conv, projection
+
+_THIN = 4
+"""The offsets' own encoder in `LateWiring` has this many times fewer channels."""
+
+
+@dataclass(frozen=True)
+class Window:
+    """The features of a window of frames: each frame's own, and what is to be added to all of them."""
+
+    frames: tuple[Float[Tensor, "b _ _ _ _"], ...]
+    """By level, finest first; of a level where older frames are not needed, the newest alone."""
+    common: tuple[Float[Tensor, "b _ _ _"], ...] | None = None
+    """What all frames share: the layers that follow are linear, so it need not be added n times."""
+
+
+class Pyramid(nn.Module):
+    """Convolutions from a frame's inputs to its features, finest level first; every level halves the grid.
+
+    A learnt static map is among the inputs. The first convolution, which is linear, takes it by itself: it is
+    the same for every frame and rollout.
+    """
+
+    def __init__(self, inputs: int, channels: Sequence[int], static: int = 0) -> None:
+        super().__init__()
+        self.inputs = inputs
+        self.first = conv(inputs + static, channels[0])
+        self.second = conv(channels[0], channels[0])
+        pairs = itertools.pairwise(channels)
+        self.deeper = nn.ModuleList(ConvBlock(shallow, deep, 2) for shallow, deep in pairs)
+
+    def static(self, maps: Float[Tensor, "1 s h w"] | None) -> Float[Tensor, "_ c _ _"]:
+        """Return what static maps and the bias give to the first convolution, for any frame."""
+        bias = self.first.bias[:, None, None]  # pyright: ignore[reportOptionalSubscript]
+        if maps is None:
+            return bias[None]
+        return nn.functional.conv2d(maps, self.first.weight[:, self.inputs :], padding=1) + bias
+
+    def begin(self, inputs: Float[Tensor, "b i h w"], start: int = 0) -> Float[Tensor, "b c h w"]:
+        """Return what some of the input channels, from number `start` on, give to the first convolution."""
+        weight = self.first.weight[:, start : start + inputs.shape[1]]
+        return nn.functional.conv2d(channels_last(inputs), weight, padding=1)
+
+    def finish(self, first: Float[Tensor, "b c h w"]) -> list[Float[Tensor, "b _ _ _"]]:
+        """Return the features from the first convolution's sums."""
+        x = nn.functional.leaky_relu(first, SLOPE)
+        features = [nn.functional.leaky_relu(self.second(x), SLOPE)]
+        for block in self.deeper:
+            features.append(block(features[-1]))
+        return features
+
+
+class Wiring(nn.Module):
+    """What all wirings have: a pyramid for the poses, and the map of identities."""
+
+    settled = True
+    """Whether a frame's features never change."""
+
+    def __init__(self, config: ModelConfig, offsets: int, size: tuple[int, int]) -> None:
+        super().__init__()
+        cell = config.pixel_shuffle**2
+        self.map_channels, self.offset_channels = cell * config.map_channels, cell * 3 * config.feedback
+        self.poses = Pyramid(self.map_channels + offsets, config.channels, config.identity_channels)
+        identity = 0.1 * torch.randn(1, config.identity_channels, *size)
+        self.identity = nn.Parameter(identity) if config.identity_channels else None
+
+    def kept_channels(self) -> Sequence[int]:
+        """Return the channels of what a frame leaves behind, by level."""
+        raise NotImplementedError
+
+    def static(self) -> Float[Tensor, "1 c _ _"]:
+        """Return what is the same for all frames; it is an argument of the next two."""
+        return self.poses.static(self.identity)
+
+    def keep(
+        self,
+        maps: Float[Tensor, "b c h w"],
+        offsets: Float[Tensor, "b o h w"],
+        static: Float[Tensor, "1 d _ _"],
+    ) -> Sequence[Float[Tensor, "b _ _ _"]]:
+        """Return what a frame leaves behind; `offsets` are those before it, newest last."""
+        raise NotImplementedError
+
+    def prepare(
+        self, kept: Sequence[Float[Tensor, "b _ _ _"]], static: Float[Tensor, "1 d _ _"]
+    ) -> Sequence[Float[Tensor, "b _ _ _"]]:
+        """Return what can be computed of a frame once and for all, from what it left behind."""
+        return kept
+
+    def window(
+        self, prepared: Sequence[Float[Tensor, "b _ _ _ _"]], offsets: Float[Tensor, "b o h w"]
+    ) -> Window:
+        """Return the window's features from its frames' `prepare`; `offsets` are the newest ones."""
+        return Window(tuple(prepared))
+
+
+class PerFrameWiring(Wiring):
+    """A frame is encoded with the offsets that preceded it, once."""
+
+    def __init__(self, config: ModelConfig, size: tuple[int, int]) -> None:
+        super().__init__(config, 3 * config.feedback * config.pixel_shuffle**2, size)
+        self.channels = config.channels
+
+    def kept_channels(self) -> Sequence[int]:
+        """Return the features' channels."""
+        return self.channels
+
+    def keep(self, maps: Tensor, offsets: Tensor, static: Tensor) -> Sequence[Tensor]:
+        """Return the frame's features."""
+        inputs = torch.cat([maps, offsets], 1)
+        return self.poses.finish(self.poses.begin(inputs) + static)
+
+
+class LateWiring(Wiring):
+    """Poses are encoded once; the newest offsets have a thin encoder, whose features every frame shares."""
+
+    def __init__(self, config: ModelConfig, size: tuple[int, int]) -> None:
+        super().__init__(config, 0, size)
+        self.channels = config.channels
+        thin = [max(1, channels // _THIN) for channels in config.channels]
+        self.offsets = Pyramid(self.offset_channels, thin) if config.feedback else None
+        self.widen = nn.ModuleList(map(projection, thin, config.channels)) if config.feedback else None
+
+    def kept_channels(self) -> Sequence[int]:
+        """Return the features' channels."""
+        return self.channels
+
+    def keep(self, maps: Tensor, offsets: Tensor, static: Tensor) -> Sequence[Tensor]:
+        """Return the pose's features."""
+        return self.poses.finish(self.poses.begin(maps) + static)
+
+    def window(self, prepared: Sequence[Tensor], offsets: Tensor) -> Window:
+        """Return the poses' features, and those of the newest offsets in common."""
+        if self.offsets is None or self.widen is None:
+            return Window(tuple(prepared))
+        thin = self.offsets.finish(self.offsets.begin(offsets) + self.offsets.static(None))
+        return Window(tuple(prepared), tuple(widen(x) for widen, x in zip(self.widen, thin, strict=True)))
+
+
+class SharedWiring(Wiring):
+    """Every frame of the window is encoded with the newest offsets: n encodings a step."""
+
+    settled = False
+
+    def __init__(self, config: ModelConfig, size: tuple[int, int]) -> None:
+        super().__init__(config, 3 * config.feedback * config.pixel_shuffle**2, size)
+
+    def kept_channels(self) -> Sequence[int]:
+        """Return the input maps' channels."""
+        return (self.map_channels,)
+
+    def keep(self, maps: Tensor, offsets: Tensor, static: Tensor) -> Sequence[Tensor]:
+        """Return the frame's input maps."""
+        return (maps,)
+
+    def prepare(self, kept: Sequence[Tensor], static: Tensor) -> Sequence[Tensor]:
+        """Return the part of the first convolution that does not see offsets."""
+        return (self.poses.begin(kept[0]) + static,)
+
+    def window(self, prepared: Sequence[Tensor], offsets: Tensor) -> Window:
+        """Return the features of all frames, encoded with the newest offsets."""
+        first = prepared[0]
+        if self.offset_channels:
+            first = first + self.poses.begin(offsets, self.map_channels)[:, None]
+        features = self.poses.finish(first.flatten(0, 1))
+        return Window(tuple(x.unflatten(0, first.shape[:2]) for x in features))
+
+
+WIRINGS: dict[str, type[PerFrameWiring] | type[LateWiring] | type[SharedWiring]] = {
+    "shared": SharedWiring,
+    "late": LateWiring,
+    "perframe": PerFrameWiring,
+}

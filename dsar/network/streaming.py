@@ -1,0 +1,195 @@
+"""Rollouts without gradients: the steps of `DualStreamNetwork.forward`, but computing only what is new.
+
+Whatever follows from a single frame is computed when it is the newest, and kept: its features (where the
+wiring lets them be), its embedded motion, its key and value, and those of its hidden state. What is kept lies
+in rings that are overwritten in place, so nothing moves as frames grow older. What follows from weights and
+ages alone is computed once, for every place that the newest frame can have in a ring.
+"""
+
+import copy
+from collections.abc import Collection, Sequence
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor, nn
+
+from dsar.network.dual_stream import STREAMS, DualStreamNetwork, NetworkOutput, Places, Stream
+from dsar.network.encoder import Window
+from dsar.network.layers import ShuffledUpsample, Upsample, channels_last
+
+_UNRECORDED = 3
+"""Steps on a GPU before one is recorded: they allocate the rings and choose the convolutions' algorithms."""
+
+_SMALL = 1024
+"""Pixels of a network's finest level up to which `ShuffledUpsample` is faster on a CPU."""
+
+
+class Clock:
+    """Says which entry of rings of n entries is the newest.
+
+    It is a tensor, so that a recorded step moves it on.
+    """
+
+    def __init__(self, length: int, device: torch.device) -> None:
+        self.length = length
+        self.newest = torch.full((1,), length - 1, dtype=torch.int64, device=device)
+
+    def tick(self) -> None:
+        """Go on to the entry that is overwritten next, the oldest."""
+        self.newest.add_(1).remainder_(self.length)
+
+    def orders(self) -> list[Int64[Tensor, " n"]]:
+        """Return, for each place that the newest entry can have, the ages of all: 0 the oldest."""
+        places = torch.arange(self.length, device=self.newest.device)
+        return [(places - newest - 1) % self.length for newest in range(self.length)]
+
+
+class Ring:
+    """What the last n frames left, as entries [b n *s]; the first frame's fills it."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self.entries: Tensor | None = None
+
+    def push(self, newest: Float[Tensor, "b *s"]) -> Float[Tensor, "b n *s"]:
+        """Write the newest entry; return all."""
+        if self.entries is None:
+            self.entries = newest[:, None].repeat(1, self._clock.length, *[1] * (newest.ndim - 1))
+        else:
+            self.entries.index_copy_(1, self._clock.newest, newest[:, None])
+        return self.entries
+
+
+class Rollout:
+    """A batch of rollouts from their first frame on, of a network as it was then."""
+
+    @torch.no_grad()
+    def __init__(
+        self,
+        network: DualStreamNetwork,
+        streams: Collection[Stream] = STREAMS,
+        precision: torch.dtype | None = None,
+    ) -> None:
+        """Start rollouts; in 16-bit numbers (bfloat16), if that is the precision."""
+        network = _laid_out(network, precision)
+        self.network, self.streams = network, streams
+        config, device = network.config, network.occupied.device
+        self._static = network.encoder.static()
+        # With features that never change and one row to attend for, keys and values never change either.
+        self._settled = network.encoder.settled and config.readout == "last"
+        clock = self._clock = Clock(config.window, device)
+        levels = len(config.channels) - 1 if self._settled else len(network.encoder.kept_channels())
+        self._frames = [Ring(clock) for _ in range(levels)]
+        self._motion = Ring(clock)
+        self._keys, self._values = Ring(clock), Ring(clock)
+        self._places = Places.stack([Places.of(network, order) for order in clock.orders()])
+        if network.bank is not None:
+            clock = self._bank_clock = Clock(config.memory, device)
+            self._bank_keys, self._bank_values = Ring(clock), Ring(clock)
+            self._bank_ages = torch.stack([network.bank.attention.ages(order) for order in clock.orders()])
+        self._offsets: Tensor | None = None
+        self._steps = 0
+        self._graph: torch.cuda.CUDAGraph | None = None
+        self._inputs: tuple[Tensor, Tensor] | None = None
+        self._output: NetworkOutput | None = None
+
+    @torch.no_grad()
+    def step(self, maps: Float[Tensor, "b c h w"], magnitude: Float[Tensor, "b 1 h w"]) -> NetworkOutput:
+        """Advance every rollout by one frame; the arguments are those of `DualStreamNetwork.forward`.
+
+        On a GPU the first steps are recorded and all later ones replayed as one CUDA graph, which overwrites
+        the output of the step before.
+        """
+        self._steps += 1
+        if not maps.is_cuda or self._steps <= _UNRECORDED:
+            return self._advance(maps, magnitude)
+        if self._graph is None or self._inputs is None:
+            self._inputs, self._graph = (maps.clone(), magnitude.clone()), torch.cuda.CUDAGraph()
+            with torch.cuda.graph(self._graph):
+                self._output = self._advance(*self._inputs)
+        self._inputs[0].copy_(maps)
+        self._inputs[1].copy_(magnitude)
+        self._graph.replay()
+        assert self._output is not None
+        return self._output
+
+    def _advance(self, maps: Tensor, magnitude: Tensor) -> NetworkOutput:
+        network = self.network
+        if self._offsets is None:
+            self._offsets = maps.new_zeros(len(maps), network.config.feedback, 3, *maps.shape[2:])
+        self._clock.tick()
+        maps, magnitude = maps.to(network.occupied.dtype), magnitude.to(network.occupied.dtype)
+        offsets = network.feedback(self._offsets, self.streams)
+        kept = network.encoder.keep(network.fold(maps), offsets, self._static)
+        prepared = network.encoder.prepare(kept, self._static)
+        motion = network.embed(magnitude) if network.motion_embedding is not None else None
+        places = self._places.choose(self._clock.newest)
+        attend = self._attend_settled if self._settled else self._attend_anew
+        window, aggregate, newest = attend(prepared, motion, offsets, places)
+        hidden = aggregate if network.bank is None else self._recall(aggregate, newest)
+        output = network.decode(window, hidden, places)
+        self._offsets.copy_(torch.cat([self._offsets, output.offset[:, None]], 1)[:, 1:])
+        return output
+
+    def _attend_settled(
+        self, prepared: Sequence[Tensor], motion: Tensor | None, offsets: Tensor, places: Places
+    ) -> tuple[Window, Tensor, Tensor]:
+        """Return the window, its aggregate and the newest deep features."""
+        network = self.network
+        deep = prepared[-1] if motion is None else prepared[-1] + motion
+        frames = [ring.push(level) for ring, level in zip(self._frames, prepared, strict=False)]
+        window = network.encoder.window([*frames, deep[:, None]], offsets)
+        key, value = network.attention.project(deep[:, None])
+        keys, values = self._keys.push(key[:, 0]), self._values.push(value[:, 0])
+        aggregate = network.aggregate(deep[:, None], keys, values, window, places)
+        return window, aggregate, _with_common(deep, window)
+
+    def _attend_anew(
+        self, prepared: Sequence[Tensor], motion: Tensor | None, offsets: Tensor, places: Places
+    ) -> tuple[Window, Tensor, Tensor]:
+        """Return the same where features or rows of all frames are needed anew."""
+        network = self.network
+        rings = [ring.push(each) for ring, each in zip(self._frames, prepared, strict=True)]
+        window = network.encoder.window(rings, offsets)
+        deep = window.frames[-1] if motion is None else window.frames[-1] + self._motion.push(motion)
+        newest = deep.index_select(1, self._clock.newest)
+        asking = deep if network.config.readout == "mean" else newest
+        aggregate = network.aggregate(asking, *network.attention.project(deep), window, places)
+        return window, aggregate, _with_common(newest[:, 0], window)
+
+    def _recall(self, aggregate: Tensor, newest: Tensor) -> Tensor:
+        """Return the hidden state of the newest frame, and put it into the bank."""
+        bank, config = self.network.bank, self.network.config
+        assert bank is not None
+        keys, values = self._bank_keys.entries, self._bank_values.entries
+        if keys is None or values is None or "state" not in self.streams:
+            alone = aggregate if config.bank == "hidden" else newest
+            keys, values = bank.attention.project(alone[:, None].expand(-1, config.memory, -1, -1, -1))
+        ages = self._bank_ages.index_select(0, self._bank_clock.newest)[0]
+        hidden = bank(aggregate, keys, values, ages)
+        self._bank_clock.tick()
+        entry = hidden if config.bank == "hidden" else newest
+        key, value = bank.attention.project(entry[:, None])
+        self._bank_keys.push(key[:, 0])
+        self._bank_values.push(value[:, 0])
+        return hidden
+
+
+def _laid_out(network: DualStreamNetwork, precision: torch.dtype | None) -> DualStreamNetwork:
+    """Return a copy of a network as convolutions without gradients like it best."""
+    network = copy.deepcopy(network)
+    if network.occupied.device.type == "cpu" and network.grid[0] * network.grid[1] <= _SMALL:
+        ups = network.decoder.ups
+        network.decoder.ups = nn.ModuleList(ShuffledUpsample(up) for up in ups if isinstance(up, Upsample))
+    if precision is not None:
+        network = network.to(precision)
+        network.decoder.head.float()
+    for parameter in network.parameters():
+        if parameter.ndim == 4:
+            parameter.data = channels_last(parameter.data)
+    return network
+
+
+def _with_common(newest: Tensor, window: Window) -> Tensor:
+    """Return the newest frame's deepest features with what all frames share."""
+    return newest if window.common is None else newest + window.common[-1]

@@ -1,0 +1,145 @@
+"""What a run will need, estimated before it starts: memory of a worker and time of an update.
+
+The network is run on torch's `meta` device, which computes sizes and no values. Rasterisation, posing and
+image losses are not counted in the time, so it is a lower bound; in memory they are small beside the network.
+"""
+
+import dataclasses
+import logging
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+from torch.utils.flop_counter import FlopCounterMode
+
+from dsar.config import TrainConfig
+from dsar.errors import ConfigError
+from dsar.network import DualStreamNetwork, NetworkState
+
+_log = logging.getLogger(__name__)
+_BYTES_PER_PARAMETER = 16
+"""Weight, gradient and two moments."""
+_BASE = 600 * 2**20
+"""What a worker needs before it has a network: interpreter, torch, kernels, capture."""
+_LONGEST_DAYS = 30
+_REPEATS = 10
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What one worker needs for one update of the autoregressive stage."""
+
+    memory: int
+    """Bytes, all in all."""
+    flop: int
+    """Floating-point operations of the network, forward and backward."""
+    parameters: int
+    """Of the network."""
+
+
+def map_size(config: TrainConfig) -> tuple[int, int]:
+    """Return height and width of the network's maps; with a garment chart, if one may come."""
+    atlas = config.atlas
+    rows = atlas.resolution + atlas.garment_rows * (atlas.garment == "auto")
+    return rows // config.model.upsample, atlas.resolution // config.model.upsample
+
+
+def estimate(config: TrainConfig) -> Budget:
+    """Return what the settings ask for."""
+    size, schedule = map_size(config), config.schedule
+    with torch.device("meta"):
+        network = DualStreamNetwork(config.model, torch.ones(size, dtype=torch.bool))
+        state = network.start(schedule.streams)
+        maps = torch.empty(schedule.streams, config.model.map_channels, *size)
+        magnitude = torch.empty(schedule.streams, 1, *size)
+    # The network looks at it, so it needs values.
+    state = dataclasses.replace(state, fresh=torch.zeros(schedule.streams, dtype=torch.bool))
+    kept: list[Tensor] = []
+
+    def keep(tensor: Tensor) -> Tensor:
+        kept.append(tensor)
+        return tensor
+
+    hooks = torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor)
+    with FlopCounterMode(display=False) as counter, hooks:
+        loss = torch.zeros((), device="meta")
+        for _ in range(schedule.segment):
+            output, state = network(maps, magnitude, state)
+            loss = loss + output.offset.sum() + output.appearance.sum()
+        loss.backward()
+    weights = {p.untyped_storage()._cdata for p in network.parameters()}
+    saved = {tensor.untyped_storage()._cdata: tensor.untyped_storage().nbytes() for tensor in kept}
+    activations = sum(size for storage, size in saved.items() if storage not in weights)
+    parameters = sum(p.numel() for p in network.parameters())
+    # A step makes the next state while the last is still there.
+    memory = _BASE + _BYTES_PER_PARAMETER * parameters + activations + 2 * _count_bytes(state)
+    return Budget(memory, counter.get_total_flops(), parameters)
+
+
+def check_budget(config: TrainConfig) -> Budget:
+    """Return the estimate of a run that fits this machine.
+
+    Raises:
+        ConfigError: it does not fit, with what to change.
+    """
+    budget, memory = estimate(config), available_memory()
+    needed = budget.memory * config.workers
+    where = f"preset {config.preset}, {config.workers} worker(s)"
+    if memory is not None and needed > memory:
+        raise ConfigError(
+            f"training ({where}) needs about {needed / 2**30:.1f} GiB, {memory / 2**30:.1f} GiB are free; "
+            f"most are activations of {config.schedule.segment} frame(s) of {config.schedule.streams} "
+            "rollout(s): lower --schedule.segment, --schedule.streams or --workers, or take --model.wiring "
+            "perframe or --preset small"
+        )
+    seconds = budget.flop / measure_flops()
+    days = seconds * config.schedule.steps / 86400
+    if config.schedule.minutes is None and days > _LONGEST_DAYS:
+        raise ConfigError(
+            f"training ({where}) would take {days:.0f} days or more: {config.schedule.steps} updates of at "
+            f"least {seconds:.1f} s; give --minutes or --steps, or take --preset small"
+        )
+    _log.info("An update needs %.1f s or more, a worker %.1f GiB", seconds, budget.memory / 2**30)
+    return budget
+
+
+def available_memory() -> int | None:
+    """Return the bytes that processes may still take, where the system tells."""
+    limits = []
+    meminfo, cgroup = Path("/proc/meminfo"), Path("/sys/fs/cgroup/memory.max")
+    if meminfo.exists():
+        entries = dict(line.split(":", 1) for line in meminfo.read_text().splitlines())
+        limits.append(1024 * int(entries["MemAvailable"].split()[0]))
+    if cgroup.exists() and (limit := cgroup.read_text().strip()).isdigit():
+        limits.append(int(limit))
+    return min(limits, default=None)
+
+
+def measure_flops() -> float:
+    """Return the floating-point operations a second of a convolution like the network's, in one thread."""
+    layer, x = nn.Conv2d(64, 64, 3, padding=1), torch.rand(4, 64, 64, 64)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with torch.no_grad():
+            layer(x)
+            start = time.perf_counter()
+            for _ in range(_REPEATS):
+                layer(x)
+            seconds = time.perf_counter() - start
+    finally:
+        torch.set_num_threads(threads)
+    return _REPEATS * 2 * 9 * 64**2 * x.numel() / 64 / seconds
+
+
+def _count_bytes(state: NetworkState) -> int:
+    sizes: list[int] = []
+
+    def add(tensor: Tensor) -> Tensor:
+        sizes.append(tensor.numel() * tensor.element_size())
+        return tensor
+
+    state.map(add)
+    return sum(sizes)
