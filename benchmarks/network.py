@@ -2,7 +2,8 @@
 
     python benchmarks/network.py [--quick] [--json FILE] [--chart DIR] [--device cpu|cuda]
 
-`rollout` is one frame of one person, without gradients, as in rendering and export; `training` is one
+`rollout` is one frame of one person, without gradients, as in rendering and export; `frame` is that with
+everything around it, from the bones to an image of the embedded capture's person; `training` is one
 frame of a batch of rollouts with its backward pass (truncated after one frame), per rollout. The literal
 design (tests/literal_network.py) encodes all n frames at every step with the newest offsets, computes all
 rows of the attention, and doubles maps before it convolves them. Inputs are random: no network here runs
@@ -21,19 +22,27 @@ import sys
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
 from results import write_json
+from scene import make_camera
 from timing import Timing, time_together
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
+from dsar.avatar.avatar import Avatar
+from dsar.avatar.track import contexts
+from dsar.body.atlas import Atlas
 from dsar.config import PRESETS, ModelConfig
+from dsar.data.capture import open_capture
 from dsar.evaluation.parts import count_parts, read_clock, time_parts
 from dsar.network import DualStreamNetwork, NetworkOutput
 from dsar.network.streaming import Rollout
+from dsar.raster import rasterize
+from dsar.types import Motion, RenderOutput
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from literal_network import LiteralNetwork, LiteralRollout
@@ -50,10 +59,10 @@ class Case:
     preset: str
     window: int
     """Frames n; the bank holds as many."""
-    size: tuple[int, int]
-    """Height and width of its maps."""
     batch: int
     """Rollouts of a step of training."""
+    image: tuple[int, int]
+    """Width and height of a drawn frame."""
 
     def config(self, wiring: str) -> ModelConfig:
         """Return the preset's network with this window and wiring."""
@@ -61,15 +70,13 @@ class Case:
         return dataclasses.replace(PRESETS[self.preset].model, **changes)
 
 
-# Maps of the embedded capture: the body's square and the garment's rows beneath it, 8 (4) texels a pixel.
-DEMO, SMALL, PAPER = (16, 12), (48, 32), (512, 512)
 CASES = (
-    Case("demo", 5, DEMO, 64),
-    Case("demo", 10, DEMO, 64),
-    Case("small", 10, SMALL, 16),
-    Case("paper", 10, PAPER, 1),
+    Case("demo", 5, 64, (192, 256)),
+    Case("demo", 10, 64, (192, 256)),
+    Case("small", 10, 16, (192, 256)),
+    Case("paper", 10, 1, (940, 1280)),
 )
-QUICK = (Case("demo", 10, DEMO, 64),)
+QUICK = (Case("demo", 10, 64, (192, 256)),)
 
 
 @dataclass(frozen=True)
@@ -79,44 +86,64 @@ class Subject:
     network: DualStreamNetwork
     """What `rollout` runs."""
     rollout: Callable[[], NetworkOutput]
-    """Computes the next frame."""
+    """Computes the network's next frame."""
+    frame: Callable[[], RenderOutput]
+    """Computes the next frame and draws it: input maps, network, posing, one image."""
     training: Callable[[], None]
     """Computes a step's gradients."""
 
 
+@cache
+def find_atlas(preset: str) -> tuple[Atlas, Motion]:
+    """Return a preset's atlas of the embedded capture, and a motion."""
+    capture, config = open_capture(), PRESETS[preset]
+    avatar = Avatar.from_capture(capture, capture.body, config.atlas, config.model)
+    fields = ("positions", "weights", "frames", "tangents", "hidden")
+    atlas = Atlas(*avatar.atlas_size, avatar.texels, *(getattr(avatar, f"texel_{name}") for name in fields))
+    return atlas, capture.motions["far"]
+
+
 def build(case: Case, design: str, device: str) -> Subject:
-    """Return a design with random weights and inputs."""
+    """Return a design with random weights."""
     torch.manual_seed(0)
+    atlas, motion = find_atlas(case.preset)
     config = case.config("shared" if design == LITERAL else design)
-    network = DualStreamNetwork(config, torch.ones(case.size, dtype=torch.bool)).to(device)
+    avatar = Avatar(open_capture().body, atlas, config, motion.fps)
+    track = avatar.track(motion).to(device)
+    network = avatar.to(device).network
     torch.nn.init.normal_(network.decoder.head.weight, std=0.01)
+    drawn = _draw(config, case, avatar.grid_size, device)
     if design == LITERAL:
         literal = LiteralNetwork(network).to(device)
-        return Subject(network, _roll(LiteralRollout(literal), config, case, device),
-                       partial(_train_literal, literal, *_draw(config, case, device)))  # fmt: skip
-    rollout = Rollout(network, precision=torch.bfloat16 if device == "cuda" else None)
-    return Subject(rollout.network, _roll(rollout, config, case, device),
-                   partial(_train, network, *_draw(config, case, device)))  # fmt: skip
-
-
-def _roll(rollout: Rollout | LiteralRollout, config: ModelConfig, case: Case, device: str) -> Callable:
-    """Return a function that advances one person, whose window is full already."""
-    maps = torch.randn(1, config.map_channels, *case.size, device=device)
-    magnitude = torch.rand(1, 1, *case.size, device=device)
+        rollout, training = LiteralRollout(literal), partial(_train_literal, literal, *drawn)
+    else:
+        rollout = Rollout(network, precision=torch.bfloat16 if device == "cuda" else None)
+        network, training = rollout.network, partial(_train, network, *drawn)
+    maps, magnitude = (x[-1, :1] for x in drawn)
 
     @torch.no_grad()
     def step() -> NetworkOutput:
         return rollout.step(maps, magnitude)
 
+    context, camera = contexts(track, torch.tensor([70])), make_camera(*case.image)
+
+    @torch.no_grad()
+    def frame() -> RenderOutput:
+        output = rollout.step(*avatar.standardized(avatar.maps(context, avatar.fps)))
+        return rasterize(avatar.gaussians(context, output)[0], camera)
+
     for _ in range(config.window + 1):
         step()
-    return step
+    return Subject(network, step, frame, training)
 
 
-def _draw(config: ModelConfig, case: Case, device: str) -> tuple[Tensor, Tensor]:
+def _draw(
+    config: ModelConfig, case: Case, size: tuple[int, int], device: str
+) -> tuple[Float[Tensor, "n b c h w"], Float[Tensor, "n b 1 h w"]]:
+    """Return random input maps and magnitudes of a window."""
     shape = (config.window, case.batch)
-    maps = torch.randn(*shape, config.map_channels, *case.size, device=device)
-    return maps, torch.rand(*shape, 1, *case.size, device=device)
+    maps = torch.randn(*shape, config.map_channels, *size, device=device)
+    return maps, torch.rand(*shape, 1, *size, device=device)
 
 
 def _train(network: DualStreamNetwork, maps: Tensor, magnitudes: Tensor) -> None:
@@ -144,9 +171,9 @@ def measure(case: Case, device: str, seconds: float) -> list[dict]:
     """Return a row for each design and pass, all designs timed in turn."""
     subjects = {design: build(case, design, device) for design in (LITERAL, *WIRINGS)}
     rows = []
-    for name, batch in (("rollout", 1), ("training", case.batch)):
+    for name, batch in (("rollout", 1), ("frame", 1), ("training", case.batch)):
         same = {"preset": case.preset, "window": case.window, "pass": name, "batch": batch}
-        same |= {"map_height": case.size[0], "map_width": case.size[1], "skipped": None}
+        same |= {"width": case.image[0], "height": case.image[1], "skipped": None}
         made = [{"design": design, **same} for design in subjects]
         rows += made
         if device == "cpu" and case.preset == "paper" and name == "training":
@@ -158,7 +185,7 @@ def measure(case: Case, device: str, seconds: float) -> list[dict]:
             function()
         for row, timing in zip(made, time_together(functions, seconds, 400), strict=True):
             row |= _per_rollout(timing, batch)
-        if device == "cpu":
+        if device == "cpu" and name != "frame":
             for row, (design, subject) in zip(made, subjects.items(), strict=True):
                 row |= _take_apart(subject, name, batch, whole=design == LITERAL)
     return rows

@@ -8,14 +8,18 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.ticker import FuncFormatter
 
-TITLES = {"rollout": "one frame of one person", "training": "one frame of a rollout, with its gradients"}
+TITLES = {
+    "rollout": "the network, one frame of one person",
+    "frame": "a whole frame: maps, network, posing, image",
+    "training": "the network, one frame with its gradients",
+}
 
 
 def draw_chart(rows: list[dict], path: Path) -> None:
     """Draw the milliseconds of every design: a panel for each pass, a group for each size of the network."""
     designs = list(dict.fromkeys(row["design"] for row in rows))
     cases = list(dict.fromkeys((row["preset"], row["window"]) for row in rows))
-    figure, panels = plt.subplots(1, 2, figsize=(13, 4.5), layout="constrained")
+    figure, panels = plt.subplots(1, len(TITLES), figsize=(18, 4.5), layout="constrained")
     for axes, (name, title) in zip(panels, TITLES.items(), strict=True):
         timed = {(row["design"], row["preset"], row["window"]): row for row in rows
                  if row["pass"] == name and not row["skipped"]}  # fmt: skip

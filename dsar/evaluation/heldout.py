@@ -6,7 +6,7 @@ white; `box` is the bounding box of the true mask. Figures are means over views.
 
 import statistics
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -21,6 +21,7 @@ from dsar.avatar.track import contexts
 from dsar.data.native import NativeCapture
 from dsar.evaluation.metrics import correlation, psnr
 from dsar.evaluation.parts import read_clock, time_parts
+from dsar.network import STREAMS, Stream
 from dsar.network.streaming import Rollout
 from dsar.raster import rasterize
 from dsar.training.losses import ssim
@@ -53,12 +54,14 @@ def render_white(gaussians: Gaussians, camera: Camera) -> Float[Tensor, "h w 3"]
 
 
 @torch.no_grad()
-def evaluate_sequence(avatar: Avatar, capture: Capture, sequence: str, stride: int) -> list[dict[str, float]]:
+def evaluate_sequence(
+    avatar: Avatar, capture: Capture, sequence: str, stride: int, *, streams: Collection[Stream] = STREAMS
+) -> list[dict[str, float]]:
     """Return the metrics of every view of every `stride`-th frame of one sequence."""
     motion = capture.motions[sequence]
     track = avatar.track(motion)
     rows = []
-    for number, gaussians in roll_out(avatar, motion):
+    for number, gaussians in roll_out(avatar, motion, streams=streams):
         frame = number - START_FRAME
         if frame % stride:
             continue
@@ -82,7 +85,9 @@ def compare(image: Tensor, template: Tensor, truth: View) -> dict[str, float]:
 
 
 @torch.no_grad()
-def one_to_many(avatar: Avatar, capture: NativeCapture) -> dict[str, float] | None:
+def one_to_many(
+    avatar: Avatar, capture: NativeCapture, *, streams: Collection[Stream] = STREAMS
+) -> dict[str, float] | None:
     """Return correlation and size ratio of predicted against true difference at one pose with two pasts.
 
     For each pair the images after a stop and at rest are subtracted, over all cameras, inside either
@@ -94,7 +99,7 @@ def one_to_many(avatar: Avatar, capture: NativeCapture) -> dict[str, float] | No
         frames = {*after, rest}
         made = {
             number - START_FRAME: gaussians
-            for number, gaussians in roll_out(avatar, capture.motions[pair.sequence])
+            for number, gaussians in roll_out(avatar, capture.motions[pair.sequence], streams=streams)
             if number - START_FRAME in frames
         }
         for index, camera in enumerate(capture.cameras):

@@ -38,7 +38,7 @@ class Progress:
     mse: float | None
     """Mean squared colour error per view, over the crop and a random background; None without images."""
     gradients: dict[str, float] | None = None
-    """Norm of each regulariser's gradient by the decoder's head as a share of L_render's, where asked for."""
+    """Norms of the regularisers' gradients by the first convolution as shares of L_render's; if asked for."""
 
 
 @dataclass(frozen=True)
@@ -221,11 +221,11 @@ class SegmentTrainer:
         return (distances * torch.tensor(known)).mean()
 
     def _compare_gradients(self, losses: Mapping[str, Tensor]) -> dict[str, float] | None:
-        head, norms = self.avatar.network.decoder.head.weight, {}
+        weight, norms = self.avatar.network.encoder.poses.first.weight, {}
         for name, loss in losses.items():
             # A loss that is switched off, or of frames without a past, is a constant.
             if loss.requires_grad:
-                (gradient,) = torch.autograd.grad(loss, head, retain_graph=True, materialize_grads=True)
+                (gradient,) = torch.autograd.grad(loss, weight, retain_graph=True, materialize_grads=True)
                 norms[name] = float(gradient.norm())
         render = norms.pop("render", 0.0)
         return {name: norm / render for name, norm in norms.items()} if render else None
