@@ -157,8 +157,8 @@ class ScheduleConfig:
     rendered: float = 0.5
     """Share of the frames, drawn by chance, that are rendered and compared; the network sees all."""
     segment: int = 1
-    """Frames K of truncated back-propagation through time (the paper's: 4). At equal time many rollouts of
-    one frame teach more than few of several: the state still carries on over whole clips."""
+    """Frames K of truncated back-propagation through time (the paper gives none; its preset: 4). At equal
+    time many rollouts of one frame teach more than few of several: the state carries on over whole clips."""
     mirrored: float = 0.5
     """Share of the rollouts that see the mirrored motion (extension): the network learns from twice the
     motions; body and cloth must be cut symmetrically, their looks need not be."""
@@ -207,7 +207,12 @@ class TrainConfig:
 
     def validate(self) -> None:
         """Raise ConfigError where settings contradict each other."""
-        atlas, model = self.atlas, self.model
+        atlas, model, schedule = self.atlas, self.model, self.schedule
+        counts = {f"model.{name}": getattr(model, name) for name in ("upsample", "pixel_shuffle")}
+        counts |= {f"schedule.{name}": getattr(schedule, name) for name in ("streams", "segment", "views")}
+        for name, count in counts.items():
+            if count < 1:
+                raise ConfigError(f"{name} is {count}; it starts at 1")
         grid = model.upsample * model.pixel_shuffle * 2 ** (len(model.channels) - 1)
         for name, size in (("resolution", atlas.resolution), ("garment_rows", atlas.garment_rows)):
             if size % grid:

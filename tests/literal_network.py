@@ -49,13 +49,15 @@ class LiteralNetwork(nn.Module):
             memory: What the last m steps left to the bank, oldest first; None at the first step.
         """
         net, config = self.network, self.network.config
-        pyramids = [self.encode(frame, given) for frame, given in zip(maps, offsets, strict=True)]
-        deep = [pyramid[-1] for pyramid in pyramids]
+        levels = [
+            level.chunk(len(maps)) for level in self.encode(torch.cat(list(maps)), torch.cat(list(offsets)))
+        ]
+        deep = levels[-1]
         if net.motion_embedding is not None:
             size = deep[0].shape[-2:]
-            pooled = [nn.functional.adaptive_avg_pool2d(magnitude, size) for magnitude in magnitudes]
-            deep = [f + net.motion_embedding.out(block(net.motion_embedding.block, v))
-                    for f, v in zip(deep, pooled, strict=True)]  # fmt: skip
+            pooled = nn.functional.adaptive_avg_pool2d(torch.cat(list(magnitudes)), size)
+            embedded = net.motion_embedding.out(block(net.motion_embedding.block, pooled))
+            deep = [f + m for f, m in zip(deep, embedded.chunk(len(maps)), strict=True)]
         tokens = torch.stack(deep, 1) + net.attention.age[:, :, None, None]
         rows = attend(net.attention, tokens, tokens, causal=config.causal)
         aggregate = rows.mean(1) if config.readout == "mean" else rows[:, -1]
@@ -69,13 +71,13 @@ class LiteralNetwork(nn.Module):
             hidden = (1 - share) * aggregate + share * recalled
             left = hidden if config.bank == "hidden" else deep[-1]
         features = []
-        for level, mixing in enumerate(net.mixing):
-            weighted = [f[level] * w[:, None, None] for f, w in zip(pyramids, mixing.weights, strict=True)]
+        for frames, mixing in zip(levels, net.mixing, strict=False):
+            weighted = [f * w[:, None, None] for f, w in zip(frames, mixing.weights, strict=True)]
             features.append(project(mixing.mix, sum(weighted)))
         return self.decode([*features, hidden]), left
 
     def encode(self, maps: Tensor, offsets: Tensor) -> list[Tensor]:
-        """Return the feature pyramid of one frame, finest level first."""
+        """Return the feature pyramids of a batch of frames, finest level first."""
         encoder, fold = self.network.encoder, self.network.config.pixel_shuffle
         maps, offsets = (nn.functional.pixel_unshuffle(x, fold) for x in (maps, offsets / OFFSET_UNIT))
         static = [] if encoder.identity is None else [encoder.identity.expand(len(maps), -1, -1, -1)]
@@ -124,6 +126,8 @@ class LiteralRollout:
             self.memory or None,
         )
         self.made.append(output.offset)
+        for history in (self.maps, self.magnitudes, self.made):
+            del history[: -(config.window + config.feedback)]
         self.memory = [*(self.memory or [left] * config.memory), left][-config.memory :]
         return output
 

@@ -127,7 +127,8 @@ class Avatar(nn.Module):
 
     def track(self, motion: Motion) -> Float[Tensor, "f k j 4 4"]:
         """Return the track of a motion."""
-        transforms = forward_kinematics(self.body, motion.rotations, motion.translations)
+        poses = motion.rotations.to(self.body_joints), motion.translations.to(self.body_joints)
+        transforms = forward_kinematics(self.body, *poses)
         return with_lags(transforms, self.body_joints[0], motion.fps, self.model.lags)
 
     def start(self, batch: int = 1) -> NetworkState:

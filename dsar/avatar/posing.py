@@ -1,4 +1,4 @@
-"""From canonical to posed Gaussians: linear blend skinning with proper rotations (paper equation 4).
+"""From canonical to posed Gaussians: linear blend skinning with proper rotations (paper equations 1 and 3).
 
 The blend of bone transforms moves the centres; its nearest rotation (polar factor) turns the
 covariances and the harmonics, in rendering and in every export alike. Neither depends on anything

@@ -72,7 +72,10 @@ def template_sequence(sequence: GaussianSequence, avatar: Avatar, motion: Motion
 def network_outputs(
     avatar: Avatar, motion: Motion, *, streams: Collection[Stream] = STREAMS
 ) -> Iterator[tuple[Float[Tensor, "1 t j 4 4"], NetworkOutput]]:
-    """Yield each frame's context and what the network makes of it."""
+    """Yield each frame's context and what the network makes of it.
+
+    On a GPU an output lasts until the next is asked for.
+    """
     track = avatar.track(motion)
     rollout = Rollout(avatar.network, streams, torch.bfloat16 if track.is_cuda else None)
     for frame in range(len(track)):
@@ -85,10 +88,11 @@ def network_outputs(
 def _produce(
     avatar: Avatar, motion: Motion, wanted: set[int], streams: Collection[Stream]
 ) -> Iterator[Gaussians]:
+    last = max(wanted)
     for frame, (context, output) in enumerate(network_outputs(avatar, motion, streams=streams)):
         if frame in wanted:
             with torch.no_grad():
                 made = avatar.gaussians(context, output)[0]
             yield made
-        if frame == max(wanted):
+        if frame == last:
             return

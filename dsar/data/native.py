@@ -70,8 +70,8 @@ class NativeCapture:
     _images: Mapping[str, "_ImageSource"] = field(repr=False)
     _garments: Mapping[str, Path] = field(repr=False)
 
-    def __reduce__(self) -> tuple[Callable[[Path], "NativeCapture"], tuple[Path]]:
-        return open_native, (self.root,)
+    def __reduce__(self) -> tuple[Callable[..., "NativeCapture"], tuple[Path, tuple[str, ...]]]:
+        return _reopen, (self.root, tuple(camera.name for camera in self.cameras))
 
     def with_cameras(self, count: int | None) -> "NativeCapture":
         """Return the capture as seen by some of its cameras, spread as far as can be; None: by all."""
@@ -256,6 +256,12 @@ def open_native(root: Path) -> NativeCapture:
             name: root / entry["garment"] for name, entry in sequences.items() if entry.get("garment")
         },
     )
+
+
+def _reopen(root: Path, cameras: tuple[str, ...]) -> NativeCapture:
+    """Return a capture as seen by the cameras of these names."""
+    capture = open_native(root)
+    return dataclasses.replace(capture, cameras=[c for c in capture.cameras if c.name in cameras])
 
 
 def _read_record(where: Path) -> dict[str, Any]:

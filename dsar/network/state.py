@@ -13,8 +13,8 @@ from torch import Tensor
 class NetworkState:
     """The two streams and the sliding window of a batch of independent rollouts.
 
-    Every tensor is meaningless while `fresh` is set: the first step fills the window with copies of
-    its own frame and the bank with copies of its own aggregate (paper: M_1 = h_1).
+    While `fresh` is set `offsets` are zero and all others meaningless: the first step fills the window with
+    copies of its own frame, looks into a bank of copies of its aggregate, and leaves one of copies of h_1.
     """
 
     fresh: Bool[Tensor, " b"]

@@ -75,7 +75,7 @@ class Rollout:
         self.network, self.streams = network, streams
         config, device = network.config, network.occupied.device
         self._static = network.encoder.static()
-        # With features that never change and one row to attend for, keys and values never change either.
+        # Where features never change, keys and values do not either; all rows would need all features, too.
         self._settled = network.encoder.settled and config.readout == "last"
         clock = self._clock = Clock(config.window, device)
         levels = len(config.channels) - 1 if self._settled else len(network.encoder.kept_channels())
@@ -179,8 +179,8 @@ def _laid_out(network: DualStreamNetwork, precision: torch.dtype | None) -> Dual
     """Return a copy of a network as convolutions without gradients like it best."""
     network = copy.deepcopy(network)
     if network.occupied.device.type == "cpu" and network.grid[0] * network.grid[1] <= _SMALL:
-        ups = network.decoder.ups
-        network.decoder.ups = nn.ModuleList(ShuffledUpsample(up) for up in ups if isinstance(up, Upsample))
+        ups = [up for up in network.decoder.ups if isinstance(up, Upsample)]
+        network.decoder.ups = nn.ModuleList(map(ShuffledUpsample, ups))
     if precision is not None:
         network = network.to(precision)
         network.decoder.head.float()

@@ -126,14 +126,13 @@ class TemporalMixing(nn.Module):
     def forward(
         self,
         frames: Float[Tensor, "b n c h w"],
-        common: Float[Tensor, "b c h w"] | None = None,
-        weights: Float[Tensor, "n c"] | None = None,
+        common: Float[Tensor, "b c h w"] | None,
+        weights: Float[Tensor, "n c"],
     ) -> Float[Tensor, "b c h w"]:
-        """Return the mixture of n frames, to each of which `common` is added first.
+        """Return the mixture of n frames, to each of which `common` is added.
 
-        `weights` are those of the frames, where these are not the oldest first.
+        `weights` are this layer's, in the order of the frames.
         """
-        weights = self.weights if weights is None else weights
         mixed = (frames * weights[:, :, None, None]).sum(1)
         if common is not None:
             mixed = mixed + common * weights.sum(0)[:, None, None]

@@ -1,7 +1,7 @@
 """What a run will need, estimated before it starts: memory of a worker and time of an update.
 
-The network is run on torch's `meta` device, which computes sizes and no values. Rasterisation, posing and
-image losses are not counted in the time, so it is a lower bound; in memory they are small beside the network.
+The network is run on torch's `meta` device, which computes sizes and no values. Posing, rasterising and
+image losses are not counted, so both are lower bounds; for the `paper` preset the network is most of it.
 """
 
 import dataclasses
@@ -23,6 +23,7 @@ _BYTES_PER_PARAMETER = 16
 """Weight, gradient and two moments."""
 _BASE = 600 * 2**20
 """What a worker needs before it has a network: interpreter, torch, kernels, capture."""
+_PAST_OUTPUTS = 2
 _LONGEST_DAYS = 30
 _REPEATS = 10
 
@@ -64,29 +65,37 @@ def estimate(config: TrainConfig) -> Budget:
 
     hooks = torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor)
     with FlopCounterMode(display=False) as counter, hooks:
-        loss = torch.zeros((), device="meta")
+        loss, output = torch.zeros((), device="meta"), None
         for _ in range(schedule.segment):
             output, state = network(maps, magnitude, state)
             loss = loss + output.offset.sum() + output.appearance.sum()
         loss.backward()
+    assert output is not None
     weights = {p.untyped_storage()._cdata for p in network.parameters()}
     saved = {tensor.untyped_storage()._cdata: tensor.untyped_storage().nbytes() for tensor in kept}
     activations = sum(size for storage, size in saved.items() if storage not in weights)
     parameters = sum(p.numel() for p in network.parameters())
-    # A step makes the next state while the last is still there.
-    memory = _BASE + _BYTES_PER_PARAMETER * parameters + activations + 2 * _count_bytes(state)
+    # A step makes the next state while the last is still there, and temporal losses look back two frames.
+    outputs = (output.offset, output.appearance, *output.features)
+    past = _PAST_OUTPUTS * sum(tensor.numel() * tensor.element_size() for tensor in outputs)
+    memory = _BASE + _BYTES_PER_PARAMETER * parameters + activations + 2 * _count_bytes(state) + past
     return Budget(memory, counter.get_total_flops(), parameters)
 
 
-def check_budget(config: TrainConfig) -> Budget:
+def check_budget(config: TrainConfig, processes: int, done: float = 0.0) -> Budget:
     """Return the estimate of a run that fits this machine.
+
+    Args:
+        config: Its settings.
+        processes: Workers on this machine.
+        done: Share of the schedule that an earlier part of the run has done.
 
     Raises:
         ConfigError: it does not fit, with what to change.
     """
     budget, memory = estimate(config), available_memory()
-    needed = budget.memory * config.workers
-    where = f"preset {config.preset}, {config.workers} worker(s)"
+    needed = budget.memory * processes
+    where = f"preset {config.preset}, {processes} worker(s) here"
     if memory is not None and needed > memory:
         raise ConfigError(
             f"training ({where}) needs about {needed / 2**30:.1f} GiB, {memory / 2**30:.1f} GiB are free; "
@@ -95,25 +104,31 @@ def check_budget(config: TrainConfig) -> Budget:
             "perframe or --preset small"
         )
     seconds = budget.flop / measure_flops()
-    days = seconds * config.schedule.steps / 86400
+    # The template's updates do not run the network.
+    share = min(1 - done, 1 - config.schedule.template_share)
+    days = seconds * share * config.schedule.steps / 86400
     if config.schedule.minutes is None and days > _LONGEST_DAYS:
         raise ConfigError(
-            f"training ({where}) would take {days:.0f} days or more: {config.schedule.steps} updates of at "
-            f"least {seconds:.1f} s; give --minutes or --steps, or take --preset small"
+            f"training ({where}) would take {days:.0f} days or more: {config.schedule.steps} updates, most "
+            f"of at least {seconds:.1f} s; give --minutes or --steps, or take --preset small"
         )
     _log.info("An update needs %.1f s or more, a worker %.1f GiB", seconds, budget.memory / 2**30)
     return budget
 
 
 def available_memory() -> int | None:
-    """Return the bytes that processes may still take, where the system tells."""
+    """Return the bytes that processes may still take, where the system tells (Linux)."""
     limits = []
-    meminfo, cgroup = Path("/proc/meminfo"), Path("/sys/fs/cgroup/memory.max")
+    meminfo, cgroup = Path("/proc/meminfo"), Path("/sys/fs/cgroup")
     if meminfo.exists():
         entries = dict(line.split(":", 1) for line in meminfo.read_text().splitlines())
         limits.append(1024 * int(entries["MemAvailable"].split()[0]))
-    if cgroup.exists() and (limit := cgroup.read_text().strip()).isdigit():
-        limits.append(int(limit))
+    limit, used = cgroup / "memory.max", cgroup / "memory.current"
+    if limit.exists() and used.exists() and limit.read_text().strip().isdigit():
+        counts = dict(line.split() for line in (cgroup / "memory.stat").read_text().splitlines())
+        # Files that nobody reads any more count as used, and make room when it is wanted.
+        taken = int(used.read_text()) - int(counts.get("inactive_file", 0))
+        limits.append(int(limit.read_text()) - taken)
     return min(limits, default=None)
 
 

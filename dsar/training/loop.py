@@ -87,14 +87,17 @@ def train(config: TrainConfig, run: Run, *, resume: bool = False, report: Report
             TrainingError when a value stops being finite.
     """
     config.validate()
-    check_budget(config)
-    open_capture(config.capture).with_cameras(config.cameras)
+    cameras = open_capture(config.capture).with_cameras(config.cameras).cameras
+    if config.schedule.views > len(cameras):
+        raise ConfigError(f"schedule.views is {config.schedule.views}; there are {len(cameras)} cameras")
     if run.exists and not resume:
         raise CheckpointError(f"{run.folder} holds a run already; go on with --resume, or give another --out")
     if resume and not run.exists:
         raise CheckpointError(f"{run.folder} holds no checkpoint to resume; leave --resume out")
     if resume:
         check_same_settings(config, config_from_json(run.config), run)
+    done = ckpt.read_progress(run)["progress"] if resume else 0.0
+    check_budget(config, workers.here(config.workers), done)
     run.folder.mkdir(parents=True, exist_ok=True)
     run.config.write_text(config_to_json(config))
     workers.run_workers(config.workers, _train, (config, run.folder, resume), report)

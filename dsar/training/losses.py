@@ -1,5 +1,6 @@
-"""Image losses (paper equation 23) and the three adaptive temporal regularisers (equations 17-22)."""
+"""Image losses (paper equation 23) and the three adaptive temporal regularisers (equations 17-21)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -119,8 +120,6 @@ class TemporalRecord:
     """The network's residual maps and features."""
     posed: Float[Tensor, "b p 3"]
     """Deformed control points in the world, metres."""
-    speed: Float[Tensor, "b 1 h w"]
-    """Motion magnitude V, metres per 1/30 s."""
 
     def detach(self) -> "TemporalRecord":
         """Cut the record from the autograd graph."""
@@ -129,11 +128,12 @@ class TemporalRecord:
             self.output.appearance.detach(),
             tuple(feature.detach() for feature in self.output.features),
         )
-        return TemporalRecord(output, self.posed.detach(), self.speed)
+        return TemporalRecord(output, self.posed.detach())
 
 
 def temporal_losses(
-    records: list[TemporalRecord],
+    records: Sequence[TemporalRecord],
+    speeds: Sequence[Float[Tensor, "b 1 h w"]],
     ages: list[int],
     occupied: Float[Tensor, "1 1 h w"],
     cells: Int64[Tensor, " p"],
@@ -141,34 +141,49 @@ def temporal_losses(
 ) -> dict[str, Float[Tensor, ""]]:
     """Return the weighted temporal losses of the newest record against the one or two before it, by name.
 
-    `ages` counts the frames that each rollout has seen before the newest: rollouts without enough
-    past are left out. The adaptive weight is exp(-V / tau_reg).
+    `records` are those of the newest frame and up to two before it, `speeds` the V of the window's frames,
+    the newest last. `ages` counts the frames that each rollout has seen before the newest: rollouts without
+    enough past are left out.
     """
     newest, losses = records[-1], {}
     if len(records) < 2:
         return losses
-    speed = torch.stack([record.speed for record in records]).amax(0)
-    if config.magnitude == "frame":
-        speed = newest.speed
-    weight = torch.exp(-speed * FPS / config.still_speed) if config.adaptive else torch.ones_like(speed)
-    weight = weight * occupied
-    one, two = (newest.posed.new_tensor([float(age >= past) for age in ages]) for past in (1, 2))
+    one, two = (_have_seen(ages, past, newest.posed) for past in (1, 2))
     previous, scale = records[-2], config.temporal_scale
+    weights = {frame: _weight(speeds, ages, frame, config) * occupied for frame in (-1, -2)}
 
     def over_rollouts(values: Float[Tensor, "b ..."], valid: Float[Tensor, " b"]) -> Float[Tensor, ""]:
         flat = values.flatten(1)
         return ((flat.mean(1) if config.reduction == "mean" else flat.sum(1)) * valid).mean()
 
     change = _change(newest.output, previous.output)
-    losses["prediction"] = scale * config.prediction * over_rollouts(weight * change, one)
+    losses["prediction"] = scale * config.prediction * over_rollouts(weights[-1] * change, one)
     pairs = zip(newest.output.features, previous.output.features, strict=True)
     apart = torch.stack([over_rollouts((current - past).square(), one) for current, past in pairs])
     losses["feature"] = scale * config.feature * _GAMMA * apart.sum()
     if len(records) > 2:
         acceleration = (newest.posed - 2 * previous.posed + records[-3].posed) * _CENTIMETRES
-        jolt = weight.flatten(1)[:, cells] * acceleration.square().sum(-1)
+        # It is the acceleration of the frame in the middle (equations 20-21).
+        jolt = weights[-2].flatten(1)[:, cells] * acceleration.square().sum(-1)
         losses["smoothness"] = scale * config.smoothness * over_rollouts(jolt, two)
     return losses
+
+
+def _weight(
+    speeds: Sequence[Float[Tensor, "b 1 h w"]], ages: list[int], frame: int, config: LossConfig
+) -> Float[Tensor, "b 1 h w"]:
+    """Return exp(-V / tau_reg), V that of a frame (-1: the newest) or the window's largest (equation 17)."""
+    if not config.adaptive:
+        return torch.ones_like(speeds[-1])
+    frames = [frame] if config.magnitude == "frame" else range(-len(speeds), 0)
+    # What came before a rollout's restart is another motion.
+    seen = [speeds[k] * _have_seen(ages, -1 - k, speeds[k])[:, None, None, None] for k in frames]
+    return torch.exp(-torch.stack(seen).amax(0) * FPS / config.still_speed)
+
+
+def _have_seen(ages: list[int], past: int, like: Tensor) -> Float[Tensor, " b"]:
+    """Return 1 for rollouts that have seen the frame so many before the newest, 0 for others."""
+    return like.new_tensor([float(age >= past) for age in ages])
 
 
 def _change(current: NetworkOutput, past: NetworkOutput) -> Float[Tensor, "b 1 h w"]:

@@ -81,7 +81,9 @@ class SegmentTrainer:
         self.state: NetworkState = avatar.start(config.schedule.streams)
         self.registered: Mapping[str, tuple[range, Tensor]] = {}
         """Frames that have a registered map, and the maps, by sequence."""
-        self.records: deque[TemporalRecord] = deque(maxlen=max(3, config.model.window))
+        self.records: deque[TemporalRecord] = deque(maxlen=3)
+        self.speeds: deque[Tensor] = deque(maxlen=max(2, config.model.window))
+        """Motion magnitudes of the window's frames, oldest first."""
 
     def template_segment(
         self, rng: np.random.Generator, still: list[tuple[str, int]], reduction: int
@@ -166,8 +168,9 @@ class SegmentTrainer:
         tensors |= {f"window.{i}": level for i, level in enumerate(self.state.window)}
         for i, record in enumerate(self.records):
             tensors |= {f"record.{i}.offset": record.output.offset, f"record.{i}.posed": record.posed}
-            tensors |= {f"record.{i}.appearance": record.output.appearance, f"record.{i}.speed": record.speed}
+            tensors[f"record.{i}.appearance"] = record.output.appearance
             tensors |= {f"record.{i}.feature.{k}": f for k, f in enumerate(record.output.features)}
+        tensors |= {f"speed.{i}": speed for i, speed in enumerate(self.speeds)}
         places = [vars(stream) for stream in self.streams.streams if stream is not None]
         return tensors, places
 
@@ -186,9 +189,10 @@ class SegmentTrainer:
             prefix = f"record.{len(self.records)}"
             features = tuple(tensors[f"{prefix}.feature.{k}"] for k in range(len(self.config.model.channels)))
             output = NetworkOutput(tensors[f"{prefix}.offset"], tensors[f"{prefix}.appearance"], features)
-            self.records.append(
-                TemporalRecord(output, tensors[f"{prefix}.posed"], tensors[f"{prefix}.speed"])
-            )
+            self.records.append(TemporalRecord(output, tensors[f"{prefix}.posed"]))
+        self.speeds.clear()
+        while f"speed.{len(self.speeds)}" in tensors:
+            self.speeds.append(tensors[f"speed.{len(self.speeds)}"])
         if places:
             self.streams.streams[:] = [Place(**place) for place in places]  # pyright: ignore[reportArgumentType]
 
@@ -234,11 +238,11 @@ class SegmentTrainer:
         """Append this frame's record and return the temporal losses against the frames before it."""
         avatar = self.avatar
         posed = avatar.deformed_control_points(step.seen, step.output)
-        self.records.append(TemporalRecord(step.output, posed, step.observed.speed))
+        self.records.append(TemporalRecord(step.output, posed))
+        self.speeds.append(step.observed.speed)
         ages = [place.age for place in step.places]
-        return temporal_losses(
-            list(self.records), ages, avatar.network.occupied, avatar.cells, self.config.loss
-        )
+        occupied, loss = avatar.network.occupied, self.config.loss
+        return temporal_losses(list(self.records), list(self.speeds), ages, occupied, avatar.cells, loss)
 
     def _finish(self, loss: Tensor, mse: Tensor | None, count: int) -> Progress:
         loss = loss / count

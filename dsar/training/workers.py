@@ -60,6 +60,11 @@ def count() -> int:
     return dist.get_world_size() if dist.is_initialized() else 1
 
 
+def here(wanted: int) -> int:
+    """Return how many workers this machine will have: those that torchrun made, else as many as wanted."""
+    return int(os.environ.get("LOCAL_WORLD_SIZE", wanted))
+
+
 def barrier() -> None:
     """Wait for all workers."""
     if dist.is_initialized():

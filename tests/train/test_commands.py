@@ -1,8 +1,11 @@
 """Every command of the README on a trained run, its files read back by readers that are not ours."""
 
+import dataclasses
 import json
+import re
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +13,8 @@ import torch
 from PIL import Image
 
 from dsar.body.files import load_body
-from dsar.cli import main
+from dsar.cli import Train, main
+from dsar.config import PRESETS
 from dsar.data.capture import open_capture
 from dsar.data.motion import write_motion
 
@@ -97,6 +101,39 @@ def test_eval_reports_what_the_contract_names(trained, tmp_path):
     assert figures["one_to_many"] is None
     assert figures["gaussians"] > 400
     assert figures["fps"] > 0
+
+
+def test_training_says_how_gradients_compare(trained):
+    lines = [json.loads(line) for line in (trained / "metrics.jsonl").read_text().splitlines()]
+    assert lines[0]["gradients"] is None, "the template has no regularisers"
+    shares = lines[-1]["gradients"]
+    assert {"spatial", "prediction", "feature", "smoothness"} <= shares.keys()
+    assert all(0 < share < 1 for share in shares.values())
+
+
+def test_settings_that_cannot_work_are_refused_before_any_work(tiny_capture, tmp_path, capsys):
+    start = ("train", tiny_capture, "--out", tmp_path / "run", "--atlas.garment", "off")
+    assert "4 cameras" in failure(capsys, *start, "--schedule.views", "9")
+    assert "cameras is 7" in failure(capsys, *start, "--cameras", "7")
+    assert "pixel_shuffle is 0" in failure(capsys, *start, "--model.pixel-shuffle", "0")
+    assert "--model.readout mean" in failure(capsys, *start, "--model.no-causal")
+    assert "GiB" in failure(capsys, *start, "--schedule.streams", "1000000")
+    assert not (tmp_path / "run").exists()
+
+
+def test_every_ablation_of_the_paper_is_a_flag(monkeypatch):
+    """As docs/paper.md names them."""
+    table = Path(__file__).parents[2] / "docs" / "paper.md"
+    rows = table.read_text().split("## Its ablations")[1].split("## ")[0].splitlines()
+    flags = [flag for row in rows if row.startswith("|") for flag in re.findall(r"`(--[^`]*)`", row)]
+    configs = []
+    monkeypatch.setattr(Train, "run", lambda self: configs.append(self.config()))
+    for flag in flags:
+        main(["train", "--preset", "paper", *re.sub(r" [NM]\b", " 7", flag).split()])
+    assert len(flags) >= 12
+    assert PRESETS["paper"] not in configs
+    for config in configs:
+        dataclasses.replace(config, model=dataclasses.replace(config.model, readout="mean")).validate()
 
 
 def test_mistakes_are_one_line_and_exit_two(trained, tmp_path, capsys):

@@ -55,14 +55,15 @@ def test_pyramid_sees_a_shift_that_plain_l1_cannot_order():
 def record(offset, *, speed=0.0, posed=0.0, feature=0.0, cells=4):
     b = len(offset)
     output = NetworkOutput(offset, torch.zeros(b, 11, 2, 2), (torch.full((b, 3, 2, 2), feature),))
-    return TemporalRecord(output, torch.full((b, cells, 3), posed), torch.full((b, 1, 2, 2), speed))
+    return TemporalRecord(output, torch.full((b, cells, 3), posed)), torch.full((b, 1, 2, 2), speed)
 
 
 def loss(records, ages, **weights):
     config = LossConfig(
         **({"feature": 0.0, "prediction": 0.0, "smoothness": 0.0, "temporal_scale": 1.0} | weights)
     )
-    terms = temporal_losses(records, ages, torch.ones(1, 1, 2, 2), torch.arange(4), config)
+    records, speeds = zip(*records, strict=True)
+    terms = temporal_losses(records, speeds, ages, torch.ones(1, 1, 2, 2), torch.arange(4), config)
     return float(sum(terms.values()))
 
 
@@ -108,6 +109,23 @@ def test_motion_anywhere_in_the_record_loosens_the_weight():
     assert abs(after_a_stop / rest - np.exp(-1)) < 1e-5
     paper = loss([record(still, speed=0.01), record(moved)], [5], prediction=1.0, magnitude="frame")
     assert paper == rest
+
+
+def test_speeds_from_before_a_restart_do_not_count():
+    still, moved = torch.zeros(1, 3, 2, 2), torch.full((1, 3, 2, 2), 0.01)
+    records = [record(still, speed=0.05), record(still), record(moved)]
+    old, young = (loss(records, [age], prediction=1.0) for age in (5, 1))
+    assert young == loss([record(still), record(still), record(moved)], [5], prediction=1.0)
+    assert old < 0.1 * young
+
+
+def test_an_acceleration_is_weighed_by_the_speed_of_the_frame_in_the_middle():
+    still = torch.zeros(1, 3, 2, 2)
+    for place in range(3):
+        speeds = [0.01 if place == k else 0.0 for k in range(3)]
+        records = [record(still, posed=p, speed=v) for p, v in zip((0.0, 0.1, 0.1), speeds, strict=True)]
+        found = loss(records, [5], smoothness=1.0, magnitude="frame") / 300.0
+        assert abs(found - (np.exp(-1) if place == 1 else 1.0)) < 1e-4
 
 
 def test_without_adaptation_motion_does_not_matter():

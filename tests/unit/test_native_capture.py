@@ -256,5 +256,6 @@ def test_some_cameras_are_spread_out_and_show_what_they_showed(tiny_capture):
     index = [camera.name for camera in whole.cameras].index(names[1])
     assert np.array_equal(half.image(sequence, 0, 1), whole.image(sequence, 0, index))
     assert whole.with_cameras(None) is whole
+    assert [camera.name for camera in pickle.loads(pickle.dumps(half)).cameras] == names
     with pytest.raises(ConfigError, match="cameras is 99"):
         whole.with_cameras(99)

@@ -186,6 +186,16 @@ ABLATIONS = {
 }
 
 
+FIRST = "encoder.poses.first.weight"
+
+
+def kept_maps(config):
+    """Return which channels of SMALL's maps another configuration has: position, then what it switches."""
+    switched = {"velocity": config.velocity, "acceleration": config.acceleration, "lags": bool(config.lags)}
+    groups = {"velocity": range(3, 6), "acceleration": range(6, 9), "lags": range(9, 18)}
+    return [0, 1, 2, *(channel for name, group in groups.items() if switched[name] for channel in group)]
+
+
 @pytest.mark.parametrize("name", ABLATIONS)
 def test_an_ablation_changes_its_part_and_the_output(name):
     changes, expected = ABLATIONS[name]
@@ -196,12 +206,26 @@ def test_an_ablation_changes_its_part_and_the_output(name):
     assert all(any(key.startswith(part) for part in expected) for key in changed)
     assert all(any(key.startswith(part) for key in changed) for part in expected)
 
-    same = {key: value for key, value in full.state_dict().items() if key not in changed}
+    weights = full.state_dict()
+    same = {key: value for key, value in weights.items() if key not in changed}
     assert not ablated.load_state_dict(same, strict=False).unexpected_keys
     maps, speed = inputs(SMALL, 8)
+    kept = kept_maps(config)
+    if FIRST in changed:
+        # The inputs that stay keep their weights, so what differs is due to those that went or came.
+        first = weights[FIRST]
+        offsets = first[:, SMALL.map_channels : SMALL.map_channels + 3]
+        parts = [first[:, kept], *[offsets] * config.feedback, first[:, -SMALL.identity_channels :]]
+        ablated.encoder.poses.first.weight.data = torch.cat(parts, 1)
     one, _ = roll(full, maps, speed)
-    two, _ = roll(ablated, maps[:, :, : config.map_channels], speed)
+    two, _ = roll(ablated, maps[:, :, kept], speed)
     assert (one[-1].offset - two[-1].offset).abs().max() > 1e-6
+    # And what was taken away is not seen: with it zero in the full network too, both are one.
+    if len(kept) < SMALL.map_channels:
+        gone = torch.ones(SMALL.map_channels)[:, None, None]
+        gone[kept] = 0
+        blind, _ = roll(full, maps * (1 - gone), speed)
+        assert torch.allclose(blind[-1].offset, two[-1].offset, atol=1e-6)
 
 
 def test_rows_that_see_the_future_differ_from_causal_ones():
@@ -212,8 +236,7 @@ def test_rows_that_see_the_future_differ_from_causal_ones():
 
 
 @pytest.mark.parametrize("stream", STREAMS)
-def test_a_stream_taken_away_at_test_time_forgets(wiring, stream):
-    """What remains must see the window and what the other stream carries, and nothing of its own."""
+def test_a_stream_taken_away_in_a_rollout_is_one_that_training_leaves_out(wiring, stream):
     config = dataclasses.replace(SMALL, wiring=wiring)
     network, (maps, speed) = build(config).double(), (x.double() for x in inputs(config, 8))
     both, rest = Rollout(network), Rollout(network, tuple(s for s in STREAMS if s != stream))
@@ -238,22 +261,21 @@ def test_sixteen_bits_are_enough_for_a_rollout():
     assert network.decoder.head.weight.dtype == torch.float32
 
 
-def test_gradients_are_those_of_the_literal_reading():
-    config = dataclasses.replace(SMALL, wiring="shared")
+def test_gradients_are_those_of_the_literal_reading(wiring):
+    """Over rollouts from their first frame on, through offsets, window and bank."""
+    config = dataclasses.replace(SMALL, wiring=wiring)
     network = build(config).double()
     literal = LiteralNetwork(network)
     maps, speed = (x.double() for x in inputs(config, 6))
-    with torch.no_grad():
-        _, state = roll(network, maps[:5], speed[:5])
-    output, _ = network(maps[5], speed[5], state)
-    given = [state.offsets.flatten(1, 2)] * config.window
-    read, _ = literal(list(maps[2:]), list(speed[2:]), given, list(state.memory.unbind(1)))
-    # Folded kernels are the literal ones' sums; embedded motion is kept, so its gradient ends at the segment.
-    others = {id(up.conv.weight) for up in network.decoder.ups}
-    others |= set(map(id, network.motion_embedding.parameters()))
-    parameters = [p for p in network.parameters() if id(p) not in others]
-    generator = torch.Generator().manual_seed(5)
-    weights = torch.randn(output.offset.shape, generator=generator).double()
-    gradients = [torch.autograd.grad((o.offset * weights).sum(), parameters) for o in (output, read)]
+    # Folded kernels are sums of the literal ones.
+    folded = {id(up.conv.weight) for up in network.decoder.ups}
+    parameters = [p for p in network.parameters() if id(p) not in folded]
+    weights = torch.randn(6, 2, 3, *SIZE, generator=torch.Generator().manual_seed(5)).double()
+    rollout = LiteralRollout(literal)
+    read = [rollout.step(*frame) for frame in zip(maps, speed, strict=True)]
+    gradients = []
+    for outputs in (roll(network, maps, speed)[0], read):
+        loss = (torch.stack([output.offset for output in outputs]) * weights).sum()
+        gradients.append(torch.autograd.grad(loss, parameters))
     for fast, slow in zip(*gradients, strict=True):
         assert (fast - slow).norm() <= 1e-9 * slow.norm() + 1e-12

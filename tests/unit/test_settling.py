@@ -39,4 +39,6 @@ def test_rounds_are_equal_and_joined_without_a_jump():
     turns = matrix_from_axis_angle(long.rotations[19 : period + 1])
     steps = (turns[1:] - turns[:-1]).flatten(2).norm(dim=-1).max()
     assert steps < 2 * largest / 15
+    moved = long.translations[19 : period + 1].diff(dim=0).norm(dim=-1).max()
+    assert moved < 2 * (motion.translations[-1] - motion.translations[0]).norm() / 15
     assert torch.equal(long.rotations[period - 15 : period], motion.rotations[:1].expand(15, -1, -1))
