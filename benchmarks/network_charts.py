@@ -22,7 +22,7 @@ def draw_chart(rows: list[dict], path: Path) -> None:
     figure, panels = plt.subplots(1, len(TITLES), figsize=(18, 4.5), layout="constrained")
     for axes, (name, title) in zip(panels, TITLES.items(), strict=True):
         timed = {(row["design"], row["preset"], row["window"]): row for row in rows
-                 if row["pass"] == name and not row["skipped"]}  # fmt: skip
+                 if row["pass"] == name}  # fmt: skip
         for k, design in enumerate(designs):
             found = [(i, timed[design, *case]) for i, case in enumerate(cases) if (design, *case) in timed]
             places = [i + 0.2 * (k - (len(designs) - 1) / 2) for i, _ in found]
