@@ -6,7 +6,7 @@ import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
-from matplotlib.ticker import FuncFormatter
+from matplotlib.ticker import FuncFormatter, NullFormatter
 
 TITLES = {
     "rollout": "the network, one frame of one person",
@@ -33,6 +33,7 @@ def draw_chart(rows: list[dict], path: Path) -> None:
             axes.bar_label(bars, [f"{ms:.3g}" for ms in medians], padding=2, fontsize=8)
         axes.set_xticks(range(len(cases)), [f"{preset}\nn = {window}" for preset, window in cases])
         axes.set_yscale("log")
+        axes.yaxis.set_minor_formatter(NullFormatter())
         axes.margins(y=0.15)
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axes.set_title(title)
