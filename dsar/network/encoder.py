@@ -78,17 +78,21 @@ class Wiring(nn.Module):
     settled = True
     """Whether a frame's features never change."""
 
-    def __init__(self, config: ModelConfig, offsets: int, size: tuple[int, int]) -> None:
+    poses_see_offsets = True
+    """Whether offsets are among a pose's inputs."""
+
+    def __init__(self, config: ModelConfig, size: tuple[int, int]) -> None:
         super().__init__()
-        cell = config.pixel_shuffle**2
+        cell, self.channels = config.pixel_shuffle**2, config.channels
         self.map_channels, self.offset_channels = cell * config.map_channels, cell * 3 * config.feedback
-        self.poses = Pyramid(self.map_channels + offsets, config.channels, config.identity_channels)
+        inputs = self.map_channels + self.offset_channels * self.poses_see_offsets
+        self.poses = Pyramid(inputs, config.channels, config.identity_channels)
         identity = 0.1 * torch.randn(1, config.identity_channels, *size)
         self.identity = nn.Parameter(identity) if config.identity_channels else None
 
     def kept_channels(self) -> Sequence[int]:
-        """Return the channels of what a frame leaves behind, by level."""
-        raise NotImplementedError
+        """Return the channels of what a frame leaves behind, by level: its features'."""
+        return self.channels
 
     def static(self) -> Float[Tensor, "1 c _ _"]:
         """Return what is the same for all frames; it is an argument of the next two."""
@@ -119,14 +123,6 @@ class Wiring(nn.Module):
 class PerFrameWiring(Wiring):
     """A frame is encoded with the offsets that preceded it, once."""
 
-    def __init__(self, config: ModelConfig, size: tuple[int, int]) -> None:
-        super().__init__(config, 3 * config.feedback * config.pixel_shuffle**2, size)
-        self.channels = config.channels
-
-    def kept_channels(self) -> Sequence[int]:
-        """Return the features' channels."""
-        return self.channels
-
     def keep(self, maps: Tensor, offsets: Tensor, static: Tensor) -> Sequence[Tensor]:
         """Return the frame's features."""
         inputs = torch.cat([maps, offsets], 1)
@@ -136,16 +132,13 @@ class PerFrameWiring(Wiring):
 class LateWiring(Wiring):
     """Poses are encoded once; the newest offsets have a thin encoder, whose features every frame shares."""
 
+    poses_see_offsets = False
+
     def __init__(self, config: ModelConfig, size: tuple[int, int]) -> None:
-        super().__init__(config, 0, size)
-        self.channels = config.channels
+        super().__init__(config, size)
         thin = [max(1, channels // _THIN) for channels in config.channels]
         self.offsets = Pyramid(self.offset_channels, thin) if config.feedback else None
         self.widen = nn.ModuleList(map(projection, thin, config.channels)) if config.feedback else None
-
-    def kept_channels(self) -> Sequence[int]:
-        """Return the features' channels."""
-        return self.channels
 
     def keep(self, maps: Tensor, offsets: Tensor, static: Tensor) -> Sequence[Tensor]:
         """Return the pose's features."""
@@ -163,9 +156,6 @@ class SharedWiring(Wiring):
     """Every frame of the window is encoded with the newest offsets: n encodings a step."""
 
     settled = False
-
-    def __init__(self, config: ModelConfig, size: tuple[int, int]) -> None:
-        super().__init__(config, 3 * config.feedback * config.pixel_shuffle**2, size)
 
     def kept_channels(self) -> Sequence[int]:
         """Return the input maps' channels."""
