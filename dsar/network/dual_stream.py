@@ -43,39 +43,29 @@ class NetworkOutput:
 class Places:
     """What depends on where in the window the frames of each age are."""
 
-    age: Float[Tensor, "*p n c"]
-    """Embedding of each frame's age."""
-    ages: Float[Tensor, "*p 2 n c"]
-    """What it adds to keys and values."""
-    weights: tuple[Float[Tensor, "*p n _"], ...]
-    """Each frame's weights in the aggregates of shallow levels, finest first."""
-    younger: Bool[Tensor, "*p n n"]
-    """Which frames (columns) are younger than which (rows)."""
+    table: Float[Tensor, "*p n _"]
+    """Side by side: what each frame's age adds to its key and value, and its weights in the aggregates of
+    shallow levels, finest first."""
+    widths: tuple[int, ...]
+    """Their channels."""
+    order: Int64[Tensor, "*p n"]
+    """Each frame's age, 0 the oldest."""
 
     @classmethod
-    def of(cls, network: "DualStreamNetwork", order: Int64[Tensor, " n"]) -> "Places":
-        """Return those of frames in an order."""
-        attention = network.attention
-        weights = tuple(mix.get_parameter("weights")[order] for mix in network.mixing)
-        return cls(attention.age[order], attention.ages(order), weights, order[:, None] < order)
-
-    @classmethod
-    def stack(cls, places: Sequence["Places"]) -> "Places":
-        """Return several as one, along a new first axis."""
-        levels = zip(*(each.weights for each in places), strict=True)
-        return cls(
-            torch.stack([each.age for each in places]),
-            torch.stack([each.ages for each in places]),
-            tuple(map(torch.stack, levels)),
-            torch.stack([each.younger for each in places]),
-        )
+    def of(cls, network: "DualStreamNetwork", order: Int64[Tensor, "*p n"]) -> "Places":
+        """Return those of frames in an order, or in each of several."""
+        weights = (mix.get_parameter("weights")[order] for mix in network.mixing)
+        columns = [network.attention.ages(order), *weights]
+        return cls(torch.cat(columns, -1), tuple(column.shape[-1] for column in columns), order)
 
     def choose(self, index: Int64[Tensor, "1"]) -> "Places":
-        """Return one of those that were stacked."""
-        age, ages, younger, *weights = (
-            table.index_select(0, index)[0] for table in (self.age, self.ages, self.younger, *self.weights)
-        )
-        return Places(age, ages, tuple(weights), younger)
+        """Return those of one of several orders."""
+        table, order = (x.index_select(0, index)[0] for x in (self.table, self.order))
+        return Places(table, self.widths, order)
+
+    def split(self) -> tuple[Float[Tensor, "*p n _"], ...]:
+        """Return the parts of the table."""
+        return self.table.split(self.widths, -1)
 
 
 class DualStreamNetwork(nn.Module):
@@ -148,7 +138,7 @@ class DualStreamNetwork(nn.Module):
             deep = deep + motion
         asking = deep if self.config.readout == "mean" else deep[:, -1:]
         places = Places.of(self, torch.arange(self.config.window, device=deep.device))
-        aggregate = self.aggregate(asking, *self.attention.project(deep), window, places)
+        aggregate = self.aggregate(asking, self.attention.project(deep), window, places)
         hidden, memory = aggregate, state.memory
         if self.bank is not None:
             newest = deep[:, -1] if window.common is None else deep[:, -1] + window.common[-1]
@@ -157,7 +147,7 @@ class DualStreamNetwork(nn.Module):
             if "state" not in streams:
                 recalled = first[:, None].expand_as(memory)
             attention = self.bank.attention
-            hidden = self.bank(aggregate, *attention.project(recalled), attention.ages())
+            hidden = self.bank(aggregate, attention.project(recalled), attention.ages())
             memory = push(recalled, hidden if self.config.bank == "hidden" else newest, state.fresh)
         output = self.decode(window, hidden, places)
         next_state = NetworkState(
@@ -171,7 +161,8 @@ class DualStreamNetwork(nn.Module):
 
     def fold(self, maps: Float[Tensor, "b c h w"]) -> Float[Tensor, "b d h2 w2"]:
         """Move the pixels of each of the network's cells into channels."""
-        return nn.functional.pixel_unshuffle(maps, self.config.pixel_shuffle)
+        fine = self.config.pixel_shuffle
+        return maps if fine == 1 else nn.functional.pixel_unshuffle(maps, fine)
 
     def feedback(
         self, offsets: Float[Tensor, "b k 3 h w"], streams: Collection[Stream]
@@ -189,32 +180,33 @@ class DualStreamNetwork(nn.Module):
     def aggregate(
         self,
         asking: Float[Tensor, "b q c h w"],
-        keys: Float[Tensor, "b n c h w"],
-        values: Float[Tensor, "b n c h w"],
+        frames: Float[Tensor, "b n h w d"],
         window: Window,
         places: Places,
     ) -> Float[Tensor, "b c h w"]:
         """Return A: what the newest frame finds in the window, or the mean of what every frame finds.
 
-        `asking` is the newest frame, or all of them in the order of the keys.
+        `asking` is the newest frame, or all of them in the order of `frames`, their keys and values.
         """
         everyone = self.config.readout == "mean"
         common = None if window.common is None else window.common[-1]
         if common is not None:
             asking = asking + common[:, None]
-        age = places.age if everyone else self.attention.age[-1:]
-        younger = places.younger if everyone and self.config.causal else None
+        age = self.attention.age[places.order] if everyone else self.attention.age[-1:]
+        younger = places.order[:, None] < places.order if everyone and self.config.causal else None
         asking = asking + age[:, :, None, None]
-        found = self.attention.attend(asking, keys, values, places.ages, common=common, younger=younger)
-        return found.mean(1)
+        found = self.attention.attend(asking, frames, places.split()[0], common=common, younger=younger)
+        return found.mean(1) if everyone else found[:, 0]
 
     def decode(self, window: Window, hidden: Float[Tensor, "b c h w"], places: Places) -> NetworkOutput:
         """Return the residual maps of the newest frame."""
         shared = window.common or (None,) * len(window.frames)
-        shallow = zip(self.mixing, window.frames, shared, places.weights, strict=False)
+        shallow = zip(self.mixing, window.frames, shared, places.split()[1:], strict=False)
         features = [mix(frames, common, weights) for mix, frames, common, weights in shallow] + [hidden]
-        raw = nn.functional.pixel_shuffle(self.decoder(features), self.config.pixel_shuffle)
-        limit = self.config.offset_limit
+        raw = self.decoder(features)
+        if self.config.pixel_shuffle > 1:
+            raw = nn.functional.pixel_shuffle(raw, self.config.pixel_shuffle)
+        limit, appearance = self.config.offset_limit, raw[:, 3 : 3 + self.config.appearance_channels]
         # A loose tanh guards long rollouts and costs nothing inside its limit.
-        offset = limit * torch.tanh(raw[:, :3] * (self.config.offset_scale / limit)) * self.occupied
-        return NetworkOutput(offset, self.config.appearance_scale * raw[:, 3:], tuple(features))
+        offset = torch.tanh(raw[:, :3] * (self.config.offset_scale / limit)) * (limit * self.occupied)
+        return NetworkOutput(offset, self.config.appearance_scale * appearance, tuple(features))

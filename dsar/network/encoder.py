@@ -20,7 +20,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from dsar.config import ModelConfig
-from dsar.network.layers import SLOPE, ConvBlock, channels_last, conv, projection
+from dsar.network.layers import SLOPE, ConvBlock, activate, channels_last, conv, projection
 
 _THIN = 4
 """The offsets' own encoder in `LateWiring` has this many times fewer channels."""
@@ -56,7 +56,8 @@ class Pyramid(nn.Module):
         bias = self.first.bias[:, None, None]  # pyright: ignore[reportOptionalSubscript]
         if maps is None:
             return bias[None]
-        return nn.functional.conv2d(maps, self.first.weight[:, self.inputs :], padding=1) + bias
+        given = nn.functional.conv2d(channels_last(maps), self.first.weight[:, self.inputs :], padding=1)
+        return channels_last(given + bias)
 
     def begin(self, inputs: Float[Tensor, "b i h w"], start: int = 0) -> Float[Tensor, "b c h w"]:
         """Return what some of the input channels, from number `start` on, give to the first convolution."""
@@ -66,7 +67,7 @@ class Pyramid(nn.Module):
     def finish(self, first: Float[Tensor, "b c h w"]) -> list[Float[Tensor, "b _ _ _"]]:
         """Return the features from the first convolution's sums."""
         x = nn.functional.leaky_relu(first, SLOPE)
-        features = [nn.functional.leaky_relu(self.second(x), SLOPE)]
+        features = [activate(self.second(x))]
         for block in self.deeper:
             features.append(block(features[-1]))
         return features

@@ -30,6 +30,16 @@ def projection(in_channels: int, out_channels: int) -> nn.Conv2d:
     return layer
 
 
+def activate(x: Tensor) -> Tensor:
+    """Apply a leaky ReLU in place, so that x is not kept for the backward pass."""
+    return nn.functional.leaky_relu_(x, SLOPE)
+
+
+def per_pixel(layer: nn.Conv2d, x: Float[Tensor, "*s c"]) -> Float[Tensor, "*s d"]:
+    """Apply a `projection` to a tensor whose last axis is the channels."""
+    return nn.functional.linear(x, layer.weight[:, :, 0, 0], layer.bias)
+
+
 class ConvBlock(nn.Module):
     """Two 3x3 convolutions, each followed by a leaky ReLU; the first may halve the resolution."""
 
@@ -40,8 +50,7 @@ class ConvBlock(nn.Module):
 
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b d h2 w2"]:
         """Return features of the block's output channels."""
-        x = nn.functional.leaky_relu(self.first(x), SLOPE)
-        return nn.functional.leaky_relu(self.second(x), SLOPE)
+        return activate(self.second(activate(self.first(x))))
 
 
 class Upsample(nn.Module):
@@ -60,7 +69,7 @@ class Upsample(nn.Module):
 
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b d h2 w2"]:
         """Return features at twice the resolution."""
-        return nn.functional.leaky_relu(self.conv(x), SLOPE)
+        return activate(self.conv(x))
 
 
 def channels_last(x: Tensor) -> Tensor:
@@ -92,4 +101,4 @@ class ShuffledUpsample(nn.Module):
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b d h2 w2"]:
         """Return features at twice the resolution."""
         x = nn.functional.conv2d(x, self.weight, self.bias, padding=1)
-        return nn.functional.leaky_relu(nn.functional.pixel_shuffle(x, 2), SLOPE)
+        return nn.functional.pixel_shuffle(activate(x), 2)

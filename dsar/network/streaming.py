@@ -16,12 +16,16 @@ from torch import Tensor, nn
 from dsar.network.dual_stream import STREAMS, DualStreamNetwork, NetworkOutput, Places, Stream
 from dsar.network.encoder import Window
 from dsar.network.layers import ShuffledUpsample, Upsample, channels_last
+from dsar.network.temporal import TemporalAttention
 
 _UNRECORDED = 3
 """Steps on a GPU before one is recorded: they allocate the rings and choose the convolutions' algorithms."""
 
 _SMALL = 1024
 """Pixels of a network's finest level up to which `ShuffledUpsample` is faster on a CPU."""
+
+_LANES = 16
+"""On such levels a matrix product of 14 columns takes half as long again as one of 16."""
 
 
 class Clock:
@@ -38,10 +42,10 @@ class Clock:
         """Go on to the entry that is overwritten next, the oldest."""
         self.newest.add_(1).remainder_(self.length)
 
-    def orders(self) -> list[Int64[Tensor, " n"]]:
+    def orders(self) -> Int64[Tensor, "n n"]:
         """Return, for each place that the newest entry can have, the ages of all: 0 the oldest."""
         places = torch.arange(self.length, device=self.newest.device)
-        return [(places - newest - 1) % self.length for newest in range(self.length)]
+        return (places - places[:, None] - 1) % self.length
 
 
 class Ring:
@@ -59,11 +63,15 @@ class Ring:
             self.entries.index_copy_(1, self._clock.newest, newest[:, None])
         return self.entries
 
+    def push_map(self, newest: Float[Tensor, "b c h w"]) -> Float[Tensor, "b n c h w"]:
+        """Do the same with maps, which lie in memory with their channels last."""
+        return self.push(newest.movedim(1, -1)).movedim(-1, 2)
+
 
 class Rollout:
     """A batch of rollouts from their first frame on, of a network as it was then."""
 
-    @torch.no_grad()
+    @torch.inference_mode()
     def __init__(
         self,
         network: DualStreamNetwork,
@@ -81,19 +89,19 @@ class Rollout:
         levels = len(config.channels) - 1 if self._settled else len(network.encoder.kept_channels())
         self._frames = [Ring(clock) for _ in range(levels)]
         self._motion = Ring(clock)
-        self._keys, self._values = Ring(clock), Ring(clock)
-        self._places = Places.stack([Places.of(network, order) for order in clock.orders()])
+        self._projected = Ring(clock)
+        self._places = Places.of(network, clock.orders())
         if network.bank is not None:
             clock = self._bank_clock = Clock(config.memory, device)
-            self._bank_keys, self._bank_values = Ring(clock), Ring(clock)
-            self._bank_ages = torch.stack([network.bank.attention.ages(order) for order in clock.orders()])
+            self._bank = Ring(clock)
+            self._bank_ages = network.bank.attention.ages(clock.orders())
         self._offsets: Tensor | None = None
         self._steps = 0
         self._graph: torch.cuda.CUDAGraph | None = None
         self._inputs: tuple[Tensor, Tensor] | None = None
         self._output: NetworkOutput | None = None
 
-    @torch.no_grad()
+    @torch.inference_mode()
     def step(self, maps: Float[Tensor, "b c h w"], magnitude: Float[Tensor, "b 1 h w"]) -> NetworkOutput:
         """Advance every rollout by one frame; the arguments are those of `DualStreamNetwork.forward`.
 
@@ -137,11 +145,10 @@ class Rollout:
         """Return the window, its aggregate and the newest deep features."""
         network = self.network
         deep = prepared[-1] if motion is None else prepared[-1] + motion
-        frames = [ring.push(level) for ring, level in zip(self._frames, prepared, strict=False)]
+        frames = [ring.push_map(level) for ring, level in zip(self._frames, prepared, strict=False)]
         window = network.encoder.window([*frames, deep[:, None]], offsets)
-        key, value = network.attention.project(deep[:, None])
-        keys, values = self._keys.push(key[:, 0]), self._values.push(value[:, 0])
-        aggregate = network.aggregate(deep[:, None], keys, values, window, places)
+        projected = self._projected.push(network.attention.project(deep[:, None])[:, 0])
+        aggregate = network.aggregate(deep[:, None], projected, window, places)
         return window, aggregate, _with_common(deep, window)
 
     def _attend_anew(
@@ -149,29 +156,27 @@ class Rollout:
     ) -> tuple[Window, Tensor, Tensor]:
         """Return the same where features or rows of all frames are needed anew."""
         network = self.network
-        rings = [ring.push(each) for ring, each in zip(self._frames, prepared, strict=True)]
+        rings = [ring.push_map(each) for ring, each in zip(self._frames, prepared, strict=True)]
         window = network.encoder.window(rings, offsets)
-        deep = window.frames[-1] if motion is None else window.frames[-1] + self._motion.push(motion)
+        deep = window.frames[-1] if motion is None else window.frames[-1] + self._motion.push_map(motion)
         newest = deep.index_select(1, self._clock.newest)
         asking = deep if network.config.readout == "mean" else newest
-        aggregate = network.aggregate(asking, *network.attention.project(deep), window, places)
+        aggregate = network.aggregate(asking, network.attention.project(deep), window, places)
         return window, aggregate, _with_common(newest[:, 0], window)
 
     def _recall(self, aggregate: Tensor, newest: Tensor) -> Tensor:
         """Return the hidden state of the newest frame, and put it into the bank."""
         bank, config = self.network.bank, self.network.config
         assert bank is not None
-        keys, values = self._bank_keys.entries, self._bank_values.entries
-        if keys is None or values is None or "state" not in self.streams:
+        frames = self._bank.entries
+        if frames is None or "state" not in self.streams:
             alone = aggregate if config.bank == "hidden" else newest
-            keys, values = bank.attention.project(alone[:, None].expand(-1, config.memory, -1, -1, -1))
+            frames = bank.attention.project(alone[:, None].expand(-1, config.memory, -1, -1, -1))
         ages = self._bank_ages.index_select(0, self._bank_clock.newest)[0]
-        hidden = bank(aggregate, keys, values, ages)
+        hidden = bank(aggregate, frames, ages)
         self._bank_clock.tick()
         entry = hidden if config.bank == "hidden" else newest
-        key, value = bank.attention.project(entry[:, None])
-        self._bank_keys.push(key[:, 0])
-        self._bank_values.push(value[:, 0])
+        self._bank.push(bank.attention.project(entry[:, None])[:, 0])
         return hidden
 
 
@@ -181,13 +186,26 @@ def _laid_out(network: DualStreamNetwork, precision: torch.dtype | None) -> Dual
     if network.occupied.device.type == "cpu" and network.grid[0] * network.grid[1] <= _SMALL:
         ups = [up for up in network.decoder.ups if isinstance(up, Upsample)]
         network.decoder.ups = nn.ModuleList(map(ShuffledUpsample, ups))
+        if network.config.pixel_shuffle == 1:
+            _pad_outputs(network.decoder.head)
     if precision is not None:
         network = network.to(precision)
         network.decoder.head.float()
     for parameter in network.parameters():
         if parameter.ndim == 4:
             parameter.data = channels_last(parameter.data)
+    for module in network.modules():
+        if isinstance(module, TemporalAttention):
+            module.freeze()
     return network
+
+
+def _pad_outputs(layer: nn.Conv2d) -> None:
+    """Add output channels that are zero, up to a multiple of _LANES."""
+    missing = -layer.out_channels % _LANES
+    assert layer.bias is not None
+    layer.weight.data = nn.functional.pad(layer.weight, (0, 0, 0, 0, 0, 0, 0, missing))
+    layer.bias.data = nn.functional.pad(layer.bias, (0, missing))
 
 
 def _with_common(newest: Tensor, window: Window) -> Tensor:

@@ -7,10 +7,9 @@ n - 1 the newest.
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
+from torch.nn.functional import linear
 
-from dsar.network.layers import ConvBlock, conv, projection
-
-Order = Int64[Tensor, " n"] | None
+from dsar.network.layers import ConvBlock, activate, channels_last, conv, per_pixel, projection
 
 
 class MotionEmbedding(nn.Module):
@@ -23,7 +22,9 @@ class MotionEmbedding(nn.Module):
 
     def forward(self, magnitude: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b c h w"]:
         """Return the embedding of a magnitude map in units of its standard deviation."""
-        return self.out(self.block(magnitude))
+        hidden = activate(self.block.first(magnitude))
+        # A single channel does not tell convolutions how it is laid out.
+        return self.out(activate(self.block.second(channels_last(hidden))))
 
 
 class TemporalAttention(nn.Module):
@@ -41,28 +42,35 @@ class TemporalAttention(nn.Module):
         self.value = projection(channels, channels)
         self.out = projection(channels, channels)
         self.age = nn.Parameter(0.02 * torch.randn(length, channels))
+        self._frozen: tuple[Tensor, Tensor] | None = None
 
-    def project(
-        self, frames: Float[Tensor, "b n c h w"]
-    ) -> tuple[Float[Tensor, "b n c h w"], Float[Tensor, "b n c h w"]]:
-        """Return keys and values of frames, without their ages."""
-        flat = frames.flatten(0, 1)
-        return (
-            self.key(flat).unflatten(0, frames.shape[:2]),
-            self.value(flat).unflatten(0, frames.shape[:2]),
-        )
+    def freeze(self) -> None:
+        """Join the weights of keys and values once and for all: they no longer change."""
+        self._frozen = self._keys_and_values()
 
-    def ages(self, order: Order = None) -> Float[Tensor, "2 n c"]:
-        """Return what their ages add to the keys and to the values of frames."""
-        ages = self.age if order is None else self.age[order]
-        return torch.stack([ages @ layer.weight[:, :, 0, 0].mT for layer in (self.key, self.value)])
+    def project(self, frames: Float[Tensor, "b n c h w"]) -> Float[Tensor, "b n h w _"]:
+        """Return keys and values of frames side by side, without their ages."""
+        return linear(frames.movedim(2, -1), *self._keys_and_values())
+
+    def ages(self, order: Int64[Tensor, "*p n"] | None = None) -> Float[Tensor, "*p n d"]:
+        """Return what their ages add to the keys and values of frames."""
+        return linear(self.age if order is None else self.age[order], self._keys_and_values()[0])
+
+    def _keys_and_values(self) -> tuple[Float[Tensor, "d c"], Float[Tensor, " d"]]:
+        """Return the weights and the bias of both, one above the other; keys have the scores' scale."""
+        if self._frozen is not None:
+            return self._frozen
+        key, value, scale = self.key, self.value, (self.key.out_channels // self.heads) ** -0.5
+        assert key.bias is not None
+        assert value.bias is not None
+        weight = torch.cat([scale * key.weight, value.weight])[:, :, 0, 0]
+        return weight, torch.cat([scale * key.bias, value.bias])
 
     def attend(
         self,
         queries: Float[Tensor, "b q c h w"],
-        keys: Float[Tensor, "b n c h w"],
-        values: Float[Tensor, "b n c h w"],
-        ages: Float[Tensor, "2 n c"],
+        frames: Float[Tensor, "b n h w d"],
+        ages: Float[Tensor, "n d"],
         *,
         common: Float[Tensor, "b c h w"] | None = None,
         younger: Bool[Tensor, "q n"] | None = None,
@@ -72,20 +80,17 @@ class TemporalAttention(nn.Module):
         `common` was to be added to every frame before they were projected. What is `younger` than a query is
         hidden from it.
         """
-        b, q, c, h, w = queries.shape
-        late = ages[:, None, :, :, None, None]
+        late = ages[:, None, None]
         if common is not None:
-            layers = (self.key, self.value)
-            late = late + torch.stack([nn.functional.conv2d(common, x.weight) for x in layers])[:, :, None]
-        keys, values = keys + late[0], values + late[1]
-        split = (self.heads, c // self.heads, h, w)
-        asked = self.query(queries.flatten(0, 1)).reshape(b, q, 1, *split)
-        keys, values = (x.reshape(b, 1, -1, *split) for x in (keys, values))
-        scores = (asked * keys).sum(4, keepdim=True) * (c // self.heads) ** -0.5
+            late = late + linear(common.movedim(1, -1), self._keys_and_values()[0])[:, None]
+        b, n, h, w, _ = frames.shape
+        keys, values = (frames + late).view(b, 1, n, h, w, 2, self.heads, -1).unbind(-3)
+        asked = per_pixel(self.query, queries.movedim(2, -1)).view(b, -1, 1, h, w, self.heads, keys.shape[-1])
+        scores = (asked * keys).sum(-1, keepdim=True)
         if younger is not None:
             scores = scores.masked_fill(younger[:, :, None, None, None, None], -torch.inf)
-        mixed = (scores.softmax(2) * values).sum(2).reshape(b * q, c, h, w)
-        return self.out(mixed).unflatten(0, (b, q))
+        mixed = (scores.softmax(2) * values).sum(2)
+        return per_pixel(self.out, mixed.flatten(-2)).movedim(-1, 2)
 
 
 class MemoryBank(nn.Module):
@@ -99,17 +104,15 @@ class MemoryBank(nn.Module):
     def forward(
         self,
         aggregate: Float[Tensor, "b c h w"],
-        keys: Float[Tensor, "b m c h w"],
-        values: Float[Tensor, "b m c h w"],
-        ages: Float[Tensor, "2 m c"],
+        frames: Float[Tensor, "b m h w d"],
+        ages: Float[Tensor, "m d"],
     ) -> Float[Tensor, "b c h w"]:
         """Return h = (1 - lambda) A + lambda CrossAttn(A, M), lambda = sigmoid(recall_logit).
 
-        Keys, values and `ages` are the attention's own projections of the bank.
+        `frames` and `ages` are the attention's own projections of the bank.
         """
-        recall = self.recall_logit.sigmoid()
-        recalled = self.attention.attend(aggregate[:, None], keys, values, ages)[:, 0]
-        return (1 - recall) * aggregate + recall * recalled
+        recalled = self.attention.attend(aggregate[:, None], frames, ages)[:, 0]
+        return aggregate.lerp(recalled, self.recall_logit.sigmoid())
 
 
 class TemporalMixing(nn.Module):
@@ -133,7 +136,7 @@ class TemporalMixing(nn.Module):
 
         `weights` are this layer's, in the order of the frames.
         """
-        mixed = (frames * weights[:, :, None, None]).sum(1)
+        mixed = (frames.movedim(2, -1) * weights[:, None, None]).sum(1)
         if common is not None:
-            mixed = mixed + common * weights.sum(0)[:, None, None]
-        return self.mix(mixed)
+            mixed = mixed + common.movedim(1, -1) * weights.sum(0)
+        return per_pixel(self.mix, mixed).movedim(-1, 1)
