@@ -48,20 +48,21 @@ class Places:
     shallow levels, finest first."""
     widths: tuple[int, ...]
     """Their channels."""
-    order: Int64[Tensor, "*p n"]
-    """Each frame's age, 0 the oldest."""
+    order: Int64[Tensor, "*p n"] | None
+    """Each frame's age, 0 the oldest, where all of them ask and not the newest alone."""
 
     @classmethod
     def of(cls, network: "DualStreamNetwork", order: Int64[Tensor, "*p n"]) -> "Places":
         """Return those of frames in an order, or in each of several."""
         weights = (mix.get_parameter("weights")[order] for mix in network.mixing)
         columns = [network.attention.ages(order), *weights]
-        return cls(torch.cat(columns, -1), tuple(column.shape[-1] for column in columns), order)
+        widths = tuple(column.shape[-1] for column in columns)
+        return cls(torch.cat(columns, -1), widths, order if network.config.readout == "mean" else None)
 
     def choose(self, index: Int64[Tensor, "1"]) -> "Places":
         """Return those of one of several orders."""
-        table, order = (x.index_select(0, index)[0] for x in (self.table, self.order))
-        return Places(table, self.widths, order)
+        order = None if self.order is None else self.order.index_select(0, index)[0]
+        return Places(self.table.index_select(0, index)[0], self.widths, order)
 
     def split(self) -> tuple[Float[Tensor, "*p n _"], ...]:
         """Return the parts of the table."""
@@ -100,15 +101,18 @@ class DualStreamNetwork(nn.Module):
 
     def start(self, batch: int) -> NetworkState:
         """Return the state of rollouts that have seen nothing yet."""
-        c, zeros = self.config, self.occupied.new_zeros
-        coarse = self.level_size(len(c.channels) - 1)
+        c, zeros, deepest = self.config, self.occupied.new_zeros, len(self.config.channels) - 1
+
+        def ring(length: int, channels: int, level: int) -> Tensor:
+            return zeros(batch, length, *self.level_size(level), channels).movedim(-1, 2)
+
         kept = enumerate(self.encoder.kept_channels())
         return NetworkState(
             fresh=torch.ones(batch, dtype=torch.bool, device=self.occupied.device),
-            window=tuple(zeros(batch, c.window, count, *self.level_size(level)) for level, count in kept),
-            motion=zeros(batch, c.window * c.motion_embedding, c.channels[-1], *coarse),
+            window=tuple(ring(c.window, count, level) for level, count in kept),
+            motion=ring(c.window * c.motion_embedding, c.channels[-1], deepest),
             offsets=zeros(batch, c.feedback, 3, *self.occupied.shape[2:]),
-            memory=zeros(batch, c.memory, c.channels[-1], *coarse),
+            memory=ring(c.memory, c.channels[-1], deepest),
         )
 
     def forward(
@@ -188,15 +192,16 @@ class DualStreamNetwork(nn.Module):
 
         `asking` is the newest frame, or all of them in the order of `frames`, their keys and values.
         """
-        everyone = self.config.readout == "mean"
+        order, age, younger = places.order, self.attention.age[-1:], None
+        if order is not None:
+            age = self.attention.age[order]
+            younger = order[:, None] < order if self.config.causal else None
         common = None if window.common is None else window.common[-1]
         if common is not None:
             asking = asking + common[:, None]
-        age = self.attention.age[places.order] if everyone else self.attention.age[-1:]
-        younger = places.order[:, None] < places.order if everyone and self.config.causal else None
         asking = asking + age[:, :, None, None]
         found = self.attention.attend(asking, frames, places.split()[0], common=common, younger=younger)
-        return found.mean(1) if everyone else found[:, 0]
+        return found[:, 0] if order is None else found.mean(1)
 
     def decode(self, window: Window, hidden: Float[Tensor, "b c h w"], places: Places) -> NetworkOutput:
         """Return the residual maps of the newest frame."""

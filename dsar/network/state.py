@@ -15,6 +15,7 @@ class NetworkState:
 
     While `fresh` is set `offsets` are zero and all others meaningless: the first step fills the window with
     copies of its own frame, looks into a bank of copies of its aggregate, and leaves one of copies of h_1.
+    In memory the channels of window, motion and bank are last, as convolutions and attention like it.
     """
 
     fresh: Bool[Tensor, " b"]
@@ -61,8 +62,9 @@ def repeat_where(
 
 
 def push(
-    ring: Float[Tensor, "b n *s"], newest: Float[Tensor, "b *s"], fresh: Bool[Tensor, " b"]
-) -> Float[Tensor, "b n *s"]:
+    ring: Float[Tensor, "b n c h w"], newest: Float[Tensor, "b c h w"], fresh: Bool[Tensor, " b"]
+) -> Float[Tensor, "b n c h w"]:
     """Drop the oldest entry of a ring and append the newest; without history it fills the ring."""
-    history = repeat_where(fresh, newest, ring)
-    return torch.cat([history[:, 1:], newest[:, None]], 1)
+    newest = newest.movedim(1, -1)
+    history = repeat_where(fresh, newest, ring.movedim(2, -1))
+    return torch.cat([history[:, 1:], newest[:, None]], 1).movedim(-1, 2)

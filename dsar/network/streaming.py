@@ -7,6 +7,7 @@ ages alone is computed once, for every place that the newest frame can have in a
 """
 
 import copy
+import itertools
 from collections.abc import Collection, Sequence
 
 import torch
@@ -136,7 +137,9 @@ class Rollout:
         window, aggregate, newest = attend(prepared, motion, offsets, places)
         hidden = aggregate if network.bank is None else self._recall(aggregate, newest)
         output = network.decode(window, hidden, places)
-        self._offsets.copy_(torch.cat([self._offsets, output.offset[:, None]], 1)[:, 1:])
+        made = [*self._offsets.unbind(1), output.offset]
+        for older, younger in itertools.pairwise(made):
+            older.copy_(younger)
         return output
 
     def _attend_settled(
