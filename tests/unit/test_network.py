@@ -261,6 +261,20 @@ def test_sixteen_bits_are_enough_for_a_rollout():
     assert network.decoder.head.weight.dtype == torch.float32
 
 
+@pytest.mark.gpu
+@pytest.mark.parametrize("variant", ["paper", "mean of rows", "no bank"])
+def test_a_recorded_rollout_is_the_one_of_the_cpu(wiring, variant):
+    """One CUDA graph is replayed for all steps after the first, wherever in the rings the newest frame is."""
+    config = dataclasses.replace(SMALL, wiring=wiring, **VARIANTS[variant])
+    network, (maps, speed) = build(config), inputs(config, 20)
+    slow, recorded = Rollout(network), Rollout(network.cuda())
+    for m, v in zip(maps, speed, strict=True):
+        expected, found = slow.step(m, v).offset, recorded.step(m.cuda(), v.cuda()).offset
+        assert torch.allclose(found.cpu(), expected, atol=1e-5)
+    assert recorded._graph is not None
+    assert expected.abs().max() > 1e-3
+
+
 def test_gradients_are_those_of_the_literal_reading(wiring):
     """Over rollouts from their first frame on, through offsets, window and bank."""
     config = dataclasses.replace(SMALL, wiring=wiring)
