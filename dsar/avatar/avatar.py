@@ -179,6 +179,10 @@ class Avatar(nn.Module):
         rows = self.cells // self.grid_size[1] * self.model.upsample
         return (rows >= self._body_rows).nonzero().squeeze(1)
 
+    def garment_texels(self) -> Int64[Tensor, " g"]:
+        """Return which Gaussians lie on the garment's chart; none where there is no such chart."""
+        return (self.texels // self.atlas_size[1] >= self._body_rows).nonzero().squeeze(1)
+
     @torch.no_grad()
     def reveal(self) -> None:
         """Show the body beneath the garment in the look of the nearest bare texel; once, the template fitted.

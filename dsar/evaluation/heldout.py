@@ -9,6 +9,7 @@ from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -19,8 +20,10 @@ from dsar.avatar.avatar import Avatar
 from dsar.avatar.rollout import START_FRAME, roll_out
 from dsar.avatar.track import contexts
 from dsar.data.native import NativeCapture
-from dsar.evaluation.metrics import correlation, psnr
+from dsar.evaluation.garment import measure_garment
+from dsar.evaluation.metrics import ImageMetric, correlation, load_perceptual, psnr
 from dsar.evaluation.parts import read_clock, time_parts
+from dsar.evaluation.temporal import temporal_psnr, trace_back, warp_error
 from dsar.network import STREAMS, Stream
 from dsar.network.streaming import Rollout
 from dsar.raster import rasterize
@@ -29,6 +32,10 @@ from dsar.training.targets import mask_box
 from dsar.types import Camera, Capture, Gaussians
 
 WHITE = torch.ones(3)
+_IMAGE_METRICS = ("psnr", "psnr_box", "psnr_box_template", "psnr_garment", "ssim", "lpips", "flip")
+METRICS = (*_IMAGE_METRICS, "tpsnr", "warp_error", "mmd")
+"""What a split has a figure of, or null."""
+_SELDOM = 4
 
 
 @dataclass(frozen=True)
@@ -55,20 +62,35 @@ def render_white(gaussians: Gaussians, camera: Camera) -> Float[Tensor, "h w 3"]
 
 @torch.no_grad()
 def evaluate_sequence(
-    avatar: Avatar, capture: Capture, sequence: str, stride: int, *, streams: Collection[Stream] = STREAMS
+    avatar: Avatar,
+    capture: Capture,
+    sequence: str,
+    stride: int,
+    *,
+    streams: Collection[Stream] = STREAMS,
+    perceptual: Mapping[str, ImageMetric] = MappingProxyType({}),
 ) -> list[dict[str, float]]:
-    """Return the metrics of every view of every `stride`-th frame of one sequence."""
+    """Return the metrics of every view of every `stride`-th frame of one sequence.
+
+    Of every 4th of them also those that take long: the `perceptual` ones, and those of two frames.
+    """
     motion = capture.motions[sequence]
     track = avatar.track(motion)
-    rows = []
+    rows, before = [], None
     for number, gaussians in roll_out(avatar, motion, streams=streams):
         frame = number - START_FRAME
-        if frame % stride:
-            continue
-        template = avatar.gaussians(contexts(track, torch.tensor([frame])), None)[0]
-        for index, camera in enumerate(capture.cameras):
-            truth = true_view(capture, sequence, frame, index)
-            rows.append(compare(render_white(gaussians, camera), render_white(template, camera), truth))
+        if frame % stride == 0:
+            template = avatar.gaussians(contexts(track, torch.tensor([frame])), None)[0]
+            for index, camera in enumerate(capture.cameras):
+                truth = true_view(capture, sequence, frame, index)
+                image = render_white(gaussians, camera)
+                row = compare(image, render_white(template, camera), truth)
+                if frame % (_SELDOM * stride) == 0 and before is not None:
+                    last = true_view(capture, sequence, frame - 1, index)
+                    row |= compare_change((before, gaussians), camera, (last, truth))
+                    row |= {name: metric(image, truth.color) for name, metric in perceptual.items()}
+                rows.append(row)
+        before = gaussians
     return rows
 
 
@@ -82,6 +104,16 @@ def compare(image: Tensor, template: Tensor, truth: View) -> dict[str, float]:
         "psnr_box_template": psnr(template[box], truth.color[box]),
         "ssim": float(ssim(image, truth.color)),
     }
+
+
+def compare_change(
+    gaussians: tuple[Gaussians, Gaussians], camera: Camera, truths: tuple[View, View]
+) -> dict[str, float]:
+    """Return the metrics of one view of two frames that follow each other."""
+    before, now = (rasterize(each, camera, background=WHITE, outputs=("contributors",)) for each in gaussians)
+    found = {"tpsnr": temporal_psnr((before.color, now.color), (truths[0].color, truths[1].color))}
+    error = warp_error(before, now, *trace_back(now, gaussians[1], gaussians[0], camera))
+    return found if error is None else found | {"warp_error": error}
 
 
 @torch.no_grad()
@@ -148,9 +180,12 @@ def time_rollout(avatar: Avatar, capture: Capture, sequence: str, frames: int = 
 def evaluate(avatar: Avatar, capture: NativeCapture, *, stride: int = 2) -> dict[str, Any]:
     """Return the held-out figures of a run in the shape of the command-line contract."""
     splits: dict[str, Any] = {}
-    by_sequence = {name: evaluate_sequence(avatar, capture, name, stride) for name in capture.splits["test"]}
-    by_sequence |= {
-        name: evaluate_sequence(avatar, capture, name, 8 * stride) for name in capture.splits["train"]
+    perceptual, skipped = load_perceptual()
+    strides = dict.fromkeys(capture.splits["train"], 8 * stride)
+    strides |= dict.fromkeys(capture.splits["test"], stride)
+    by_sequence = {
+        name: evaluate_sequence(avatar, capture, name, each, perceptual=perceptual)
+        for name, each in strides.items()
     }
     for split in ("train", "test", "nd", "fd"):
         names = [name for name in capture.splits.get(split, ()) if name in by_sequence]
@@ -163,19 +198,20 @@ def evaluate(avatar: Avatar, capture: NativeCapture, *, stride: int = 2) -> dict
         "gaussians": avatar.num_gaussians,
         "parameters": sum(p.numel() for p in avatar.network.parameters()),
         "one_to_many": one_to_many(avatar, capture),
-        "skipped": {
-            "lpips, flip, tpsnr, warp_error, mmd, psnr_garment": "not measured by this version",
+        "garment": {
+            name: measure_garment(avatar, capture, name, 2 * stride) for name in capture.splits["test"]
         },
+        "skipped": skipped | dict.fromkeys(("mmd", "psnr_garment"), "not measured by this version"),
     }
 
 
 def summarize(
     by_sequence: Mapping[str, Sequence[Mapping[str, float]]], names: Sequence[str], views: int
 ) -> dict[str, float | int | None]:
-    """Return means over all views of some sequences; null for what this version does not measure."""
+    """Return means over all views of some sequences that have a figure; null where none has."""
     rows = [row for name in names for row in by_sequence[name]]
-    means: dict[str, float | int | None] = {
-        key: statistics.fmean(row[key] for row in rows) for key in rows[0]
-    }
-    unmeasured = ("psnr_garment", "lpips", "flip", "tpsnr", "warp_error", "mmd")
-    return means | dict.fromkeys(unmeasured) | {"frames": len(rows) // views, "views": views}
+    means: dict[str, float | int | None] = {}
+    for key in METRICS:
+        values = [row[key] for row in rows if key in row]
+        means[key] = statistics.fmean(values) if values else None
+    return means | {"frames": len(rows) // views, "views": views}

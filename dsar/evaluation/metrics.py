@@ -1,13 +1,26 @@
 """Image metrics, each on display-referred sRGB in [0, 1]."""
 
+import importlib.util
+from collections.abc import Callable
+
+import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from dsar.training.lpips import find_lpips_weights, load_lpips
+
+ImageMetric = Callable[[Float[Tensor, "h w 3"], Float[Tensor, "h w 3"]], float]
+"""From an image and its truth."""
 
 
 def psnr(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float:
     """Return the peak signal-to-noise ratio in dB; values outside [0, 1] are clipped first."""
-    mse = (image.clamp(0, 1) - truth.clamp(0, 1)).square().mean().clamp_min(1e-10)
-    return float(-10 * mse.log10())
+    return decibels((image.clamp(0, 1) - truth.clamp(0, 1)).square().mean())
+
+
+def decibels(mse: Float[Tensor, ""]) -> float:
+    """Return the signal-to-noise ratio of a mean squared error against a peak of 1; 100 dB at most."""
+    return float(-10 * mse.clamp_min(1e-10).log10())
 
 
 def correlation(a: Float[Tensor, " n"], b: Float[Tensor, " n"]) -> float:
@@ -15,3 +28,36 @@ def correlation(a: Float[Tensor, " n"], b: Float[Tensor, " n"]) -> float:
     a, b = a.double() - a.double().mean(), b.double() - b.double().mean()
     norm = a.norm() * b.norm()
     return float(a @ b / norm) if norm > 1e-12 else 0.0
+
+
+def flip(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float:
+    """Return the mean LDR-FLIP of an image (Andersson et al. 2020) at the default 67 pixels per degree.
+
+    Needs the package flip-evaluator.
+    """
+    import flip_evaluator
+
+    pair = (x.clamp(0, 1).contiguous().cpu().numpy() for x in (truth, image))
+    return float(flip_evaluator.evaluate(*pair, "LDR", applyMagma=False, computeMeanError=True)[1])
+
+
+def load_perceptual() -> tuple[dict[str, ImageMetric], dict[str, str]]:
+    """Return the perceptual metrics that this installation can compute, and why it cannot compute others."""
+    metrics: dict[str, ImageMetric] = {}
+    skipped = {}
+    if find_lpips_weights("alex").exists():
+        model = load_lpips("alex")
+
+        @torch.no_grad()
+        def lpips(image: Tensor, truth: Tensor) -> float:
+            pair = (x.clamp(0, 1).movedim(-1, 0)[None].float().cpu() for x in (image, truth))
+            return float(model(*pair))
+
+        metrics["lpips"] = lpips
+    else:
+        skipped["lpips"] = "its weights are not on this machine: run tools/fetch_lpips.py"
+    if importlib.util.find_spec("flip_evaluator"):
+        metrics["flip"] = flip
+    else:
+        skipped["flip"] = 'package flip-evaluator is missing: pip install "dsar-avatar[eval]"'
+    return metrics, skipped

@@ -90,15 +90,22 @@ def test_a_motion_file_drives_the_avatar_as_the_capture_does(trained, tiny_captu
     assert np.allclose(a, b, atol=1e-4)
 
 
-def test_eval_reports_what_the_contract_names(trained, tmp_path):
+def test_eval_reports_what_the_contract_names(trained, tmp_path, monkeypatch):
+    monkeypatch.setenv("DSAR_CACHE", str(tmp_path))
     command("eval", trained, "--json", tmp_path / "eval.json")
     figures = json.loads((tmp_path / "eval.json").read_text())
     assert set(figures["splits"]) == {"train", "test", "nd", "fd"}
     test = figures["splits"]["test"]
     assert test["psnr"] > test["psnr_box"] > 8
     assert test["views"] == 4
+    assert 0 < test["flip"] < 1
+    assert 10 < test["tpsnr"] < 60
+    assert 0 < test["warp_error"] < 0.05
     assert test["lpips"] is None
+    assert "fetch_lpips" in figures["skipped"]["lpips"]
+    assert all(key in figures["skipped"] for key, value in test.items() if value is None)
     assert figures["one_to_many"] is None
+    assert set(figures["garment"].values()) == {None}
     assert figures["gaussians"] > 400
     assert figures["fps"] > 0
 

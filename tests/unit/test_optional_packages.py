@@ -9,7 +9,16 @@ from dsar.types import Camera, Gaussians, GaussianSequence, RenderOutput
 from dsar_exporters import read_ply, write_exr, write_ply, write_usd
 from dsar_render import write_mp4
 
-OPTIONAL = ("pxr", "OpenEXR", "OpenImageIO", "plyfile", "gsply", "imageio_ffmpeg", "mitsuba")
+OPTIONAL = (
+    "pxr",
+    "OpenEXR",
+    "OpenImageIO",
+    "plyfile",
+    "gsply",
+    "imageio_ffmpeg",
+    "mitsuba",
+    "flip_evaluator",
+)
 
 
 def _no_frames():

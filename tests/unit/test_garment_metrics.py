@@ -1,0 +1,83 @@
+"""Shapes whose distances are known."""
+
+import math
+
+import pytest
+import torch
+
+from dsar.evaluation.garment import (
+    closest_on_triangles,
+    distance_to_mesh,
+    hem_loop,
+    measure_hem,
+    measure_shape,
+)
+
+
+def skirt(around: int = 60, rows: int = 20, top: float = 0.1, bottom: float = 0.3):
+    """A cone that hangs from y = 1 down to y = 0.5; its hem is the last row."""
+    angle = torch.arange(around) * (2 * math.pi / around)
+    share = torch.linspace(0, 1, rows + 1)
+    radius = top + (bottom - top) * share
+    x, z = (radius[:, None] * wave for wave in (angle.cos(), angle.sin()))
+    vertices = torch.stack([x, (1 - 0.5 * share)[:, None].expand_as(x), z], -1).reshape(-1, 3)
+    corner = torch.arange(rows)[:, None] * around + torch.arange(around)
+    right = torch.arange(rows)[:, None] * around + (torch.arange(around) + 1) % around
+    faces = torch.stack(
+        [
+            torch.stack([corner, right, corner + around], -1),
+            torch.stack([right, right + around, corner + around], -1),
+        ]
+    )
+    return vertices, faces.reshape(-1, 3)
+
+
+def test_the_nearest_point_of_a_triangle_is_that_of_a_fine_grid_on_it():
+    generator = torch.Generator().manual_seed(0)
+    triangles, points = (torch.randn(40, *s, generator=generator) for s in ((3, 3), (3,)))
+    found = closest_on_triangles(points, triangles)
+    steps = torch.arange(401) / 400
+    s, t = (x.flatten() for x in torch.meshgrid(steps, steps, indexing="ij"))
+    s, t = s[s + t <= 1], t[s + t <= 1]
+    for point, triangle, close in zip(points, triangles, found, strict=True):
+        grid = (
+            triangle[0] + s[:, None] * (triangle[1] - triangle[0]) + t[:, None] * (triangle[2] - triangle[0])
+        )
+        best = float((grid - point).norm(dim=-1).amin())
+        assert float((close - point).norm()) <= best + 1e-5
+        assert float((close - point).norm()) >= best - 0.02
+
+
+def test_a_cloud_beside_the_surface_is_as_far_as_it_was_moved():
+    vertices, faces = skirt()
+    triangles = vertices[faces]
+    normals = torch.linalg.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    lifted = triangles.mean(1) + 0.013 * normals / normals.norm(dim=-1, keepdim=True)
+    distance = distance_to_mesh(lifted, vertices, faces)
+    # Inside the cone a neighbouring facet may be nearer, by the angle between them.
+    assert torch.allclose(distance, torch.full_like(distance, 0.013), rtol=0.01)
+    on_it = measure_shape(triangles.mean(1), vertices, faces)
+    assert on_it["chamfer"] < 0.01
+    assert on_it["fscore"] == 1
+    away = measure_shape(lifted + torch.tensor([1.0, 0, 0]), vertices, faces)
+    assert away["chamfer"] > 0.5
+    assert away["fscore"] == 0
+
+
+def test_half_a_garment_is_precise_but_not_complete():
+    vertices, faces = skirt()
+    centers = vertices[faces].mean(1)
+    half = measure_shape(centers[centers[:, 0] > 0], vertices, faces)
+    precision, recall = 1.0, 0.5
+    assert half["fscore"] == pytest.approx(2 * precision * recall / (precision + recall), abs=0.06)
+
+
+def test_the_hem_is_the_lowest_border():
+    vertices, faces = skirt()
+    loop = hem_loop(vertices, faces)
+    assert loop.tolist() == list(range(20 * 60, 21 * 60))
+    radius, height = measure_hem(vertices[loop])
+    assert radius == pytest.approx(0.3, abs=1e-5)
+    assert height == pytest.approx(0.5, abs=1e-5)
+    # Wherever the person goes.
+    assert measure_hem(vertices[loop] + torch.tensor([3.0, 0.0, 2.0])) == pytest.approx((0.3, 0.5), abs=1e-5)
