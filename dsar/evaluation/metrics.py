@@ -37,8 +37,8 @@ def flip(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float:
     """
     import flip_evaluator
 
-    pair = (x.clamp(0, 1).contiguous().cpu().numpy() for x in (truth, image))
-    return float(flip_evaluator.evaluate(*pair, "LDR", applyMagma=False, computeMeanError=True)[1])
+    reference, test = (x.clamp(0, 1).contiguous().cpu().numpy() for x in (truth, image))
+    return float(flip_evaluator.evaluate(reference, test, "LDR", applyMagma=False)[1])
 
 
 def load_perceptual() -> tuple[dict[str, ImageMetric], dict[str, str]]:
