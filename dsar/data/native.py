@@ -113,6 +113,14 @@ class NativeCapture:
         unit = self._read_garment(sequence, "unit")
         return (np.cumsum(steps.astype(np.int32), 0) * float(unit)).astype(np.float32)
 
+    def garment_runs(self, sequence: str) -> int:
+        """Return how many true outcomes of a sequence `garment` knows; 0 without garment truth."""
+        path = self._garments.get(sequence)
+        if path is None:
+            return 0
+        with np.load(path) as file:
+            return sum(key.startswith("run") for key in file.files)
+
     def garment_faces(self, sequence: str) -> Int[np.ndarray, "t 3"]:
         """Return the triangles of the garment's vertices, counter-clockwise seen from outside."""
         return self._read_garment(sequence, "faces").astype(np.int64)

@@ -10,7 +10,6 @@ from torch import Tensor
 from dsar.avatar.avatar import Avatar
 from dsar.avatar.rollout import START_FRAME, roll_out, template_sequence
 from dsar.data.native import NativeCapture
-from dsar.errors import CaptureError
 
 CLOSE = 0.02
 """Metres within which a point counts as right in the F-score."""
@@ -90,20 +89,17 @@ def measure_hem(points: Float[Tensor, "h 3"]) -> tuple[float, float]:
 def measure_garment(
     avatar: Avatar, capture: NativeCapture, sequence: str, stride: int
 ) -> dict[str, dict[str, float]] | None:
-    """Return figures of the predicted garment on every `stride`-th frame, metres; None without any truth.
+    """Return the garment's figures on every `stride`-th frame, metres; None without truth or a chart.
 
     Beside the prediction: `template` is the garment at rest under skinning alone, what a model without any
     history gives; `second` is another simulation of the same motion, begun from a slightly different state:
     what cannot be predicted. `hem_radius` and `hem_height` are root mean square errors over frames.
     """
-    try:
-        truth = torch.from_numpy(capture.garment(sequence))
-        faces = torch.from_numpy(capture.garment_faces(sequence))
-    except CaptureError:
+    runs, garment = capture.garment_runs(sequence), avatar.garment_texels()
+    if not runs or not len(garment):
         return None
-    garment = avatar.garment_texels()
-    if not len(garment):
-        return None
+    truth = torch.from_numpy(capture.garment(sequence))
+    faces = torch.from_numpy(capture.garment_faces(sequence))
     rows = avatar.texels[garment] // avatar.atlas_size[1]
     lowest = garment[rows == rows.max()]
     hem = hem_loop(truth[0], faces)
@@ -113,11 +109,9 @@ def measure_garment(
         name: ((g.means[garment], g.means[lowest]) for _, g in each)
         for name, each in (("predicted", rollout), ("template", template_sequence(rollout, avatar, motion)))
     }
-    try:
+    if runs > 1:
         other = torch.from_numpy(capture.garment(sequence, run=1))
         shapes["second"] = ((other[frame], other[frame, hem]) for frame in frames)
-    except CaptureError:
-        pass
     return {name: _summarize(each, truth[::stride], faces, hem) for name, each in shapes.items()}
 
 

@@ -190,6 +190,9 @@ def evaluate(avatar: Avatar, capture: NativeCapture, *, stride: int = 2) -> dict
     for split in ("train", "test", "nd", "fd"):
         names = [name for name in capture.splits.get(split, ()) if name in by_sequence]
         splits[split] = summarize(by_sequence, names, len(capture.cameras)) if names else None
+    garments = {name: measure_garment(avatar, capture, name, 2 * stride) for name in capture.splits["test"]}
+    if not all(garments.values()):
+        skipped["garment"] = "no simulated garment in the capture, or no garment chart in the avatar"
     milliseconds = time_rollout(avatar, capture, capture.splits["test"][0])
     return {
         "splits": splits,
@@ -198,9 +201,7 @@ def evaluate(avatar: Avatar, capture: NativeCapture, *, stride: int = 2) -> dict
         "gaussians": avatar.num_gaussians,
         "parameters": sum(p.numel() for p in avatar.network.parameters()),
         "one_to_many": one_to_many(avatar, capture),
-        "garment": {
-            name: measure_garment(avatar, capture, name, 2 * stride) for name in capture.splits["test"]
-        },
+        "garment": garments,
         "skipped": skipped | dict.fromkeys(("mmd", "psnr_garment"), "not measured by this version"),
     }
 

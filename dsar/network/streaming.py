@@ -106,6 +106,7 @@ class Rollout:
     def step(self, maps: Float[Tensor, "b c h w"], magnitude: Float[Tensor, "b 1 h w"]) -> NetworkOutput:
         """Advance every rollout by one frame; the arguments are those of `DualStreamNetwork.forward`.
 
+        The output is made in inference mode: no gradient can be asked of it, clones excepted.
         On a GPU the first steps are recorded and all later ones replayed as one CUDA graph, which overwrites
         the output of the step before.
         """

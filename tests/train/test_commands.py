@@ -106,6 +106,7 @@ def test_eval_reports_what_the_contract_names(trained, tmp_path, monkeypatch):
     assert all(key in figures["skipped"] for key, value in test.items() if value is None)
     assert figures["one_to_many"] is None
     assert set(figures["garment"].values()) == {None}
+    assert "garment" in figures["skipped"]
     assert figures["gaussians"] > 400
     assert figures["fps"] > 0
 

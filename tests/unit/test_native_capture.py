@@ -181,6 +181,11 @@ def test_a_folder_without_record_is_refused(tmp_path):
         open_capture(tmp_path)
 
 
+def test_garment_runs_are_counted(folder):
+    capture = open_capture(folder)
+    assert (capture.garment_runs("walk"), capture.garment_runs("run")) == (1, 0)
+
+
 def test_unknown_garments_and_runs_are_refused(folder):
     capture = open_capture(folder)
     with pytest.raises(CaptureError, match="no garment truth for 'run'; it has walk"):
