@@ -109,7 +109,8 @@ class Train(Common):
     def run(self) -> None:
         """Train, then leave a contact sheet."""
         from dsar.training.checkpoint import Run, read_progress
-        from dsar.training.loop import Report, train
+        from dsar.training.loop import train
+        from dsar.training.report import Report
 
         self.check_device()
         run = Run(self.out or Path("runs") / self.preset)

@@ -1,15 +1,12 @@
 """The training loop: read it from top to bottom."""
 
 import dataclasses
-import json
-import logging
-import math
 import shutil
 import signal
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +16,7 @@ from torch import nn
 from dsar.avatar.avatar import Avatar
 from dsar.avatar.stillness import stillest_frames
 from dsar.body.files import load_body
-from dsar.config import ScheduleConfig, TrainConfig, config_from_json, config_to_json
+from dsar.config import TrainConfig, config_from_json, config_to_json
 from dsar.data.capture import open_capture
 from dsar.errors import CaptureError, CheckpointError, ConfigError, TrainingError
 from dsar.training import checkpoint as ckpt
@@ -27,54 +24,19 @@ from dsar.training import workers
 from dsar.training.budget import check_budget
 from dsar.training.checkpoint import Run
 from dsar.training.lpips import load_lpips
-from dsar.training.muon import Muon
+from dsar.training.optimizers import make_optimizers, set_rates
 from dsar.training.registration import Registration
+from dsar.training.report import REPORT_EVERY, Monitor, Reporter
 from dsar.training.segment import Progress, SegmentTrainer
 from dsar.training.stages import Position, position
 from dsar.types import Capture
 
-_log = logging.getLogger(__name__)
-REPORT_EVERY = 20
-"""Updates between lines of metrics.jsonl."""
 SAVE_EVERY = 200
 """Updates between checkpoints (not seconds: all workers must agree)."""
 STILL_FRAMES = 48
 """Near-rest frames that the template is fitted to."""
 PROBE_EVERY = 100
 """Updates between comparisons of the losses' gradients, each of which costs as much as some updates."""
-_LEAST_SHARE, _LARGEST_SHARE = 1e-4, 1.0
-_TEMPLATE_RATES = {
-    "means": 1e-3,
-    "quaternions": 5e-3,
-    "log_scales": 1e-2,
-    "opacity_logits": 5e-2,
-    "harmonics": 4e-2,
-}
-
-
-@dataclass(frozen=True)
-class Report:
-    """One line of progress."""
-
-    step: int
-    """Updates done."""
-    steps: int
-    """Updates planned."""
-    progress: float
-    """Share of the schedule done, in [0, 1]."""
-    stage: str
-    """Stage of training."""
-    loss: float
-    """Smoothed loss."""
-    psnr: float
-    """Smoothed PSNR of training crops, dB."""
-    seconds: float
-    """Seconds since the first update of this process."""
-    gradients: dict[str, float] | None = None
-    """Each regulariser's gradient as a share of the images', when they were last compared."""
-
-
-Reporter = Callable[[Report], None]
 
 
 def train(config: TrainConfig, run: Run, *, resume: bool = False, report: Reporter | None = None) -> Run:
@@ -142,8 +104,7 @@ def _train(config: TrainConfig, folder: Path, resume: bool, report: Reporter | N
         registration.carry_on(ckpt.load_registration(run.checkpoint, workers.rank()))
         trainer.registered = registration.result
     clock, used, stop = Clock(schedule.minutes), 0.0, False
-    smoothed: Progress | None = None
-    warned: set[str] = set()
+    monitor = Monitor(run.metrics, schedule.steps, report)
     with _stop_signals() as received:
         while progress < 1:
             if stop:
@@ -152,15 +113,15 @@ def _train(config: TrainConfig, folder: Path, resume: bool, report: Reporter | N
                 return
             now = position(schedule, progress)
             if now.stage != "template" and not registration.complete:
-                line = Report(step, schedule.steps, progress, "registration", 0.0, 0.0, 0.0)
-                stop, used = _register(registration, gradients, received, clock, line, report)
+                show = partial(monitor.show, step, progress, "registration")
+                stop, used = _register(registration, gradients, received, clock, show)
                 trainer.registered = registration.result
                 continue
             set_rates(optimizers, now)
             rng = np.random.default_rng([config.seed, workers.rank(), step])
             gradients.clear()
             done = _segment(trainer, still, rng, now, step)
-            _warn_of_gradients(done, warned)
+            monitor.update(done)
             before, (stop, used) = used, gradients.average(bool(received), clock.used())
             if not gradients.buffer.isfinite().all():
                 raise TrainingError(f"step {step}: the gradient of {bad_gradient(avatar)} is not finite")
@@ -170,9 +131,8 @@ def _train(config: TrainConfig, folder: Path, resume: bool, report: Reporter | N
             clock.start()
             step += 1
             progress = max(step / schedule.steps, progress + (used - before) * registration.haste)
-            smoothed = _smooth(smoothed, done)
             if workers.rank() == 0 and (step % REPORT_EVERY == 0 or progress >= 1):
-                _report(run, config, step, progress, now, smoothed, clock.seconds(), report)
+                monitor.write(step, progress, now.stage, clock.seconds())
             if progress >= 1 or step % SAVE_EVERY == 0:
                 save(run, avatar, optimizers, trainer, registration, step, progress)
 
@@ -182,8 +142,7 @@ def _register(
     gradients: workers.Gradients,
     received: list[int],
     clock: "Clock",
-    line: Report,
-    report: Reporter | None,
+    show: Callable[[float, Progress], None],
 ) -> tuple[bool, float]:
     """Fit the registered maps; return whether a stop came before the last, and the time used so far."""
     began = registration.used - clock.used()
@@ -194,9 +153,8 @@ def _register(
         gradients.clear()
         stop, used = gradients.average(bool(received), clock.used())
         registration.used = began + used
-        if report is not None and done is not None and registration.count % REPORT_EVERY == 0:
-            now = {"loss": done.loss, "psnr": _psnr(done.mse), "seconds": clock.seconds()}
-            report(dataclasses.replace(line, **now))
+        if done is not None and registration.count % REPORT_EVERY == 0:
+            show(clock.seconds(), done)
     if registration.complete:
         registration.share()
     return stop, used
@@ -259,30 +217,6 @@ def still_frames(trainer: SegmentTrainer, fps: float) -> list[tuple[str, int]]:
     return stillest_frames(tracks, fps, STILL_FRAMES, per_sequence)
 
 
-def make_optimizers(avatar: Avatar, schedule: ScheduleConfig) -> Mapping[str, torch.optim.Optimizer]:
-    """Return Muon for the network's hidden convolutions and Adam for all else; rates are set each update.
-
-    Adam's epsilon is far below the default: inner gradients of this network are smaller than 1e-8.
-    """
-    hidden = avatar.network.hidden_weights() if schedule.matrix_rate else []
-    chosen = {id(weight) for weight in hidden}
-    rest = [p for p in avatar.network.parameters() if id(p) not in chosen]
-    groups = [{"params": rest, "name": "network"}]
-    groups += [{"params": [p], "name": name} for name, p in avatar.template.named_parameters()]
-    adam = torch.optim.Adam(groups, lr=0.0, betas=(0.9, 0.99), eps=1e-15, fused=True)
-    return {"adam": adam} | ({"muon": Muon(hidden)} if hidden else {})
-
-
-def set_rates(optimizers: Mapping[str, torch.optim.Optimizer], now: Position) -> None:
-    """Set the learning rates of this update."""
-    for group in optimizers["adam"].param_groups:
-        name = group["name"]
-        group["lr"] = now.network_rate if name == "network" else _TEMPLATE_RATES[name] * now.template_factor
-    if "muon" in optimizers:
-        for group in optimizers["muon"].param_groups:
-            group["lr"] = now.matrix_rate
-
-
 def bad_gradient(avatar: Avatar) -> str:
     """Return the name of the first parameter whose gradient is not finite."""
     named = avatar.named_parameters()
@@ -333,50 +267,6 @@ class Clock:
     def used(self) -> float:
         """Return the share of the budget used; 0 without a budget."""
         return 0.0 if self.minutes is None else self.seconds() / (60 * self.minutes)
-
-
-def _smooth(before: Progress | None, now: Progress) -> Progress:
-    if before is None:
-        return now
-    # An update without images keeps what the last images said.
-    mse = now.mse if before.mse is None else before.mse
-    if now.mse is not None and before.mse is not None:
-        mse = 0.95 * before.mse + 0.05 * now.mse
-    gradients = before.gradients if now.gradients is None else now.gradients
-    return Progress(0.95 * before.loss + 0.05 * now.loss, mse, gradients)
-
-
-def _warn_of_gradients(done: Progress, warned: set[str]) -> None:
-    """Say once of each regulariser that it moves nothing, or more than the images do."""
-    for name, share in (done.gradients or {}).items():
-        if name not in warned and not (share == 0 or _LEAST_SHARE <= share <= _LARGEST_SHARE):
-            warned.add(name)
-            effect = "moves almost nothing" if share < 1 else "outweighs the images"
-            _log.warning("Loss %s %s: its gradient is %.2g times theirs", name, effect, share)
-
-
-def _psnr(mse: float | None) -> float:
-    return -10 * math.log10(max(mse or 0.0, 1e-10))
-
-
-def _report(
-    run: Run,
-    config: TrainConfig,
-    step: int,
-    progress: float,
-    now: Position,
-    smoothed: Progress,
-    seconds: float,
-    reporter: Reporter | None,
-) -> None:
-    psnr = _psnr(smoothed.mse)
-    line = Report(
-        step, config.schedule.steps, progress, now.stage, smoothed.loss, psnr, seconds, smoothed.gradients
-    )
-    with run.metrics.open("a") as file:
-        file.write(json.dumps(dataclasses.asdict(line)) + "\n")
-    if reporter is not None:
-        reporter(line)
 
 
 @contextmanager

@@ -11,7 +11,7 @@ from dsar.avatar.track import contexts
 from dsar.config import AtlasConfig, TrainConfig
 from dsar.data.capture import open_capture
 from dsar.raster import rasterize
-from dsar.training import loop
+from dsar.training.optimizers import make_optimizers, set_rates
 from dsar.training.segment import SegmentTrainer
 from dsar.training.stages import Position
 from dsar.training.workers import Gradients
@@ -121,11 +121,11 @@ def test_one_fitted_frame_covers_the_mask(capture, sequence, frame):
     avatar = Avatar.from_capture(capture, capture.body, config.atlas, config.model).train()
     avatar.reveal()
     trainer = SegmentTrainer(config, capture, avatar, {sequence: range(frame + 1)}, None)
-    optimizers = loop.make_optimizers(avatar, config.schedule)
+    optimizers = make_optimizers(avatar, config.schedule)
     gradients = Gradients(list(avatar.parameters()))
     for step in range(110):
         reduction, factor = (2, 1.0) if step < 50 else (1, 0.5)
-        loop.set_rates(optimizers, Position("template", 1, reduction, 0.0, 0.0, factor))
+        set_rates(optimizers, Position("template", 1, reduction, 0.0, 0.0, factor))
         gradients.clear()
         trainer.template_segment(np.random.default_rng(step), [(sequence, frame)], reduction)
         optimizers["adam"].step()

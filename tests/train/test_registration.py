@@ -11,6 +11,7 @@ from dsar.avatar.track import contexts
 from dsar.config import ModelConfig, TrainConfig
 from dsar.data.capture import open_capture
 from dsar.training import loop
+from dsar.training.optimizers import make_optimizers, set_rates
 from dsar.training.registration import Registration, share_out
 from dsar.training.segment import SegmentTrainer
 from dsar.training.stages import position
@@ -30,11 +31,11 @@ def registered():
     trainer = SegmentTrainer(config, capture, avatar, loop.training_clips(config, capture), None)
     still = loop.still_frames(trainer, avatar.fps)
     optimizers, gradients = (
-        loop.make_optimizers(avatar, config.schedule),
+        make_optimizers(avatar, config.schedule),
         Gradients(list(avatar.parameters())),
     )
     for step in range(60):
-        loop.set_rates(optimizers, position(config.schedule, 0.12 * step / 60))
+        set_rates(optimizers, position(config.schedule, 0.12 * step / 60))
         gradients.clear()
         trainer.template_segment(np.random.default_rng([0, step]), still, 1)
         optimizers["adam"].step()
@@ -87,10 +88,10 @@ def test_the_network_learns_to_follow_maps_that_lag_behind_the_motion(registered
     small = Avatar.from_capture(capture, capture.body, config.atlas, model)
     trainer = SegmentTrainer(config, capture, small, {SEQUENCE: range(4, LAST + 1)}, None)
     trainer.registered = registration.result
-    optimizers = loop.make_optimizers(small, config.schedule)
+    optimizers = make_optimizers(small, config.schedule)
     gradients, losses = Gradients(list(small.parameters())), []
     for step in range(60):
-        loop.set_rates(optimizers, position(config.schedule, 0.13 + 0.15 * step / 60))
+        set_rates(optimizers, position(config.schedule, 0.13 + 0.15 * step / 60))
         gradients.clear()
         losses.append(trainer.imitation_segment(np.random.default_rng([1, step])).loss)
         for optimizer in optimizers.values():

@@ -1,0 +1,90 @@
+"""What a run says of itself while it trains: metrics.jsonl, a listener, and warnings."""
+
+import dataclasses
+import json
+import logging
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from dsar.training.segment import Progress
+
+_log = logging.getLogger(__name__)
+REPORT_EVERY = 20
+"""Updates between lines of metrics.jsonl."""
+_LEAST_SHARE, _LARGEST_SHARE = 1e-4, 1.0
+_NEW = 0.05
+"""Weight of the newest update in smoothed values."""
+
+
+@dataclass(frozen=True)
+class Report:
+    """One line of progress."""
+
+    step: int
+    """Updates done."""
+    steps: int
+    """Updates planned."""
+    progress: float
+    """Share of the schedule done, in [0, 1]."""
+    stage: str
+    """Stage of training."""
+    loss: float
+    """Smoothed loss."""
+    psnr: float
+    """Smoothed PSNR of training crops, dB."""
+    seconds: float
+    """Seconds since the first update of this process."""
+    gradients: dict[str, float] | None = None
+    """Each regulariser's gradient as a share of the images', when they were last compared."""
+
+
+Reporter = Callable[[Report], None]
+
+
+class Monitor:
+    """Smooths what updates report, and passes it on."""
+
+    def __init__(self, metrics: Path, steps: int, reporter: Reporter | None) -> None:
+        self._metrics, self._steps, self._reporter = metrics, steps, reporter
+        self._smoothed: Progress | None = None
+        self._warned: set[str] = set()
+
+    def update(self, done: Progress) -> None:
+        """Take in one update; say once of each regulariser that it moves nothing, or more than images do."""
+        self._smoothed = _smooth(self._smoothed, done)
+        for name, share in (done.gradients or {}).items():
+            if name not in self._warned and not (share == 0 or _LEAST_SHARE <= share <= _LARGEST_SHARE):
+                self._warned.add(name)
+                effect = "moves almost nothing" if share < 1 else "outweighs the images"
+                _log.warning("Loss %s %s: its gradient is %.2g times theirs", name, effect, share)
+
+    def write(self, step: int, progress: float, stage: str, seconds: float) -> None:
+        """Append a line of smoothed values to metrics.jsonl and show it to the listener."""
+        assert self._smoothed is not None
+        line = self._line(step, progress, stage, seconds, self._smoothed)
+        with self._metrics.open("a") as file:
+            file.write(json.dumps(dataclasses.asdict(line)) + "\n")
+        if self._reporter is not None:
+            self._reporter(line)
+
+    def show(self, step: int, progress: float, stage: str, seconds: float, done: Progress) -> None:
+        """Show the listener work that counts as no update."""
+        if self._reporter is not None:
+            self._reporter(self._line(step, progress, stage, seconds, done))
+
+    def _line(self, step: int, progress: float, stage: str, seconds: float, done: Progress) -> Report:
+        psnr = -10 * math.log10(max(done.mse or 0.0, 1e-10))
+        return Report(step, self._steps, progress, stage, done.loss, psnr, seconds, done.gradients)
+
+
+def _smooth(before: Progress | None, now: Progress) -> Progress:
+    if before is None:
+        return now
+    # An update without images keeps what the last images said.
+    mse = now.mse if before.mse is None else before.mse
+    if now.mse is not None and before.mse is not None:
+        mse = (1 - _NEW) * before.mse + _NEW * now.mse
+    gradients = before.gradients if now.gradients is None else now.gradients
+    return Progress((1 - _NEW) * before.loss + _NEW * now.loss, mse, gradients)
