@@ -2,6 +2,9 @@
 
 All directions of a step get the same length. In short runs the cloth's dynamics were learnt in fewer updates
 than with Adam (docs/log.md).
+
+After each step a weight gets back the norm it had (Karras et al. 2024, EDM2). Steps of a fixed length would make it
+grow with their number, and nothing in this network normalises: features grew 400- to 12,000-fold in 3,000 updates.
 """
 
 from collections.abc import Callable, Iterable
@@ -22,7 +25,7 @@ class Muon(torch.optim.Optimizer):
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> None:  # type: ignore[override]
-        """Move every weight by its rate along the orthogonalised Nesterov momentum of its gradient."""
+        """Turn every weight by its rate along the orthogonalised Nesterov momentum of its gradient."""
         if closure is not None:
             raise ValueError("Muon takes no closure: gradients are computed before the step")
         for group in self.param_groups:
@@ -35,7 +38,9 @@ class Muon(torch.optim.Optimizer):
                 ahead = weight.grad.lerp(average, group["momentum"]).flatten(1)
                 rows, columns = ahead.shape
                 step = orthogonalize(ahead).reshape(weight.shape)
+                norm = weight.norm()
                 weight.add_(step, alpha=-group["lr"] * max(1.0, rows / columns) ** 0.5)
+                weight.mul_(norm / weight.norm())
 
 
 def orthogonalize(matrix: Float[Tensor, "r c"]) -> Float[Tensor, "r c"]:

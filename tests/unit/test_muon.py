@@ -18,13 +18,27 @@ def test_orthogonalised_matrix_keeps_its_singular_vectors_and_evens_out_its_sing
     assert torch.equal(orthogonalize(torch.zeros(3, 4)), torch.zeros(3, 4))
 
 
+def test_a_weight_keeps_its_norm_however_many_steps_push_it_one_way():
+    weight = torch.nn.Parameter(torch.randn(8, 3, 3, 3, generator=torch.Generator().manual_seed(2)))
+    push, norm = torch.ones_like(weight), weight.detach().norm()
+    optimizer = Muon([weight])
+    optimizer.param_groups[0]["lr"] = 0.2
+    for _ in range(500):
+        weight.grad = push.clone()
+        optimizer.step()
+    torch.testing.assert_close(weight.detach().norm(), norm)
+    assert torch.nn.functional.cosine_similarity(weight.detach().flatten(), -push.flatten(), 0) > 0.99
+
+
 def test_muon_fits_an_ill_conditioned_regression_that_gradient_descent_does_not():
     generator = torch.Generator().manual_seed(1)
     inputs = torch.randn(200, 12, generator=generator) * torch.logspace(0, -2, 12)
     truth = torch.randn(12, 6, generator=generator)
+    start = torch.randn(6, 12, generator=generator)
+    start *= truth.norm() / start.norm()
 
     def fit(make):
-        weight = torch.nn.Parameter(torch.zeros(6, 12))
+        weight = torch.nn.Parameter(start.clone())
         optimizer = make([weight])
         for step in range(300):
             for group in optimizer.param_groups:
