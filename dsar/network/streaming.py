@@ -84,10 +84,10 @@ class Rollout:
         self.network, self.streams = network, streams
         config, device = network.config, network.occupied.device
         self._static = network.encoder.static()
-        # Where features never change, keys and values do not either; all rows would need all features, too.
-        self._settled = network.encoder.settled and config.readout == "last"
+        # Where features never change, keys and values do not either, and the newest row needs no others.
+        self._settled = network.encoder.settled
         clock = self._clock = Clock(config.window, device)
-        levels = len(config.channels) - 1 if self._settled else len(network.encoder.kept_channels())
+        levels = len(network.encoder.kept_channels()) - (self._settled and config.readout == "last")
         self._frames = [Ring(clock) for _ in range(levels)]
         self._motion = Ring(clock)
         self._projected = Ring(clock)
@@ -149,16 +149,19 @@ class Rollout:
         """Return the window, its aggregate and the newest deep features."""
         network = self.network
         deep = prepared[-1] if motion is None else prepared[-1] + motion
-        frames = [ring.push_map(level) for ring, level in zip(self._frames, prepared, strict=False)]
-        window = network.encoder.window([*frames, deep[:, None]], offsets)
+        levels = [*prepared[:-1], deep]
+        frames = [ring.push_map(level) for ring, level in zip(self._frames, levels, strict=False)]
+        if network.config.readout == "last":
+            frames.append(deep[:, None])
+        window = network.encoder.window(frames, offsets)
         projected = self._projected.push(network.attention.project(deep[:, None])[:, 0])
-        aggregate = network.aggregate(deep[:, None], projected, window, places)
+        aggregate = network.aggregate(frames[-1], projected, window, places)
         return window, aggregate, _with_common(deep, window)
 
     def _attend_anew(
         self, prepared: Sequence[Tensor], motion: Tensor | None, offsets: Tensor, places: Places
     ) -> tuple[Window, Tensor, Tensor]:
-        """Return the same where features or rows of all frames are needed anew."""
+        """Return the same where the features of all frames are needed anew."""
         network = self.network
         rings = [ring.push_map(each) for ring, each in zip(self._frames, prepared, strict=True)]
         window = network.encoder.window(rings, offsets)

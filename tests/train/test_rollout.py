@@ -7,6 +7,7 @@ import torch
 
 from dsar.avatar.avatar import Avatar
 from dsar.avatar.rollout import network_outputs, roll_out
+from dsar.avatar.track import contexts
 from dsar.body.atlas import Atlas, body_chart
 from dsar.body.files import load_body
 from dsar.config import ModelConfig
@@ -100,3 +101,23 @@ def test_a_teleport_cannot_explode_the_network(avatar):
         assert gaussians.means.isfinite().all()
         gap = gaussians.means - gaussians.means.median(0).values
         assert gap.norm(dim=1).max() < 3
+
+
+@pytest.mark.parametrize(
+    ("setting", "off", "gone"),
+    [("velocity", False, range(3, 6)), ("acceleration", False, range(6, 9)), ("lags", (), range(9, 18))],
+)
+def test_maps_that_are_switched_off_leave_the_others_and_the_speed_as_they_are(setting, off, gone):
+    body, atlas = load_body(), Atlas.stack([body_chart(load_body(), 16)])
+    config = ModelConfig(channels=(4, 8), heads=2)
+    seen = []
+    for model in (config, dataclasses.replace(config, **{setting: off})):
+        avatar = Avatar(body, atlas, model, 30.0)
+        context = contexts(avatar.track(dance(20)), torch.arange(5, 15))
+        seen.append(avatar.maps(context, 30.0))
+        assert seen[-1].maps.shape[1] == model.map_channels
+    full, less = seen
+    kept = [channel for channel in range(config.map_channels) if channel not in gone]
+    assert all(full.maps[:, channel].abs().max() > 1e-4 for channel in range(config.map_channels))
+    assert torch.equal(full.maps[:, kept], less.maps)
+    assert torch.equal(full.speed, less.speed)
