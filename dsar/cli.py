@@ -304,6 +304,33 @@ class Eval(Common):
         sys.stdout.write(f"one-to-many {figures['one_to_many']}\n")
 
 
+@dataclass(frozen=True)
+class Stress(Common):
+    """Drive an avatar where rollouts fail."""
+
+    run_folder: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(name="run")] = None
+    """Run folder; default: the newest under runs/."""
+
+    def run(self) -> None:
+        """Run the battery on the held-out motion that is furthest from training; print each verdict."""
+        from dsar.data.capture import open_capture
+        from dsar.evaluation.stress import CASES, stress
+        from dsar.training.checkpoint import Run, load_checkpoint, newest_run
+
+        self.check_device()
+        avatar, config, _ = load_checkpoint(Run(self.run_folder) if self.run_folder else newest_run())
+        capture = open_capture(config.capture)
+        verdicts = stress(avatar, capture.motions[capture_sequence(capture, "test") or ""])
+        found = {}
+        for name, verdict in follow(verdicts, len(CASES), self.progress, "stress"):
+            found[name] = verdict.to_json()
+            outcome = "passed" if verdict.passed else "FAILED"
+            sys.stdout.write(f"{name:9s} {outcome}  {verdict.describe()}\n")
+        survived = sum(case["pass"] for case in found.values())
+        sys.stdout.write(f"{survived} of {len(found)} passed\n")
+        self.write_json({"cases": found, "survived": survived, "tried": len(found)})
+
+
 def shown(sequence: GaussianSequence, style: ProgressStyle, title: str) -> GaussianSequence:
     """Return the same sequence, showing progress as it is produced."""
     return dataclasses.replace(
@@ -355,7 +382,7 @@ def write_contact_sheet(folder: Path) -> Path:
     return write_sheet(folder / "previews" / "sheet.png", rows, columns=columns)
 
 
-def parse(arguments: Sequence[str]) -> Train | Export | Render | Eval:
+def parse(arguments: Sequence[str]) -> Train | Export | Render | Eval | Stress:
     """Return the command that the arguments ask for; the preset decides the other defaults."""
     preset = "demo"
     for flag, value in itertools.pairwise(arguments):
@@ -368,6 +395,7 @@ def parse(arguments: Sequence[str]) -> Train | Export | Render | Eval:
         | Annotated[Export, tyro.conf.subcommand("export")]
         | Annotated[Render, tyro.conf.subcommand("render")]
         | Annotated[Eval, tyro.conf.subcommand("eval")]
+        | Annotated[Stress, tyro.conf.subcommand("stress")]
     )
     return tyro.cli(commands, args=arguments, prog="dsar", description=__doc__)  # pyright: ignore
 

@@ -3,8 +3,9 @@
 All directions of a step get the same length. In short runs the cloth's dynamics were learnt in fewer updates
 than with Adam (docs/log.md).
 
-After each step a weight gets back the norm it had (Karras et al. 2024, EDM2). Steps of a fixed length would make it
-grow with their number, and nothing in this network normalises: features grew 400- to 12,000-fold in 3,000 updates.
+After each step a weight gets back the norm it had (Karras et al. 2024, EDM2). Steps of a fixed length would
+make it grow with their number, and nothing in this network normalises: in 3,000 updates its features grew
+400- to 12,000-fold.
 """
 
 from collections.abc import Callable, Iterable
