@@ -34,7 +34,6 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from dsar.avatar.avatar import Avatar
-from dsar.avatar.track import contexts
 from dsar.body.atlas import Atlas
 from dsar.config import PRESETS, ModelConfig
 from dsar.data.capture import open_capture
@@ -125,7 +124,7 @@ def build(case: Case, design: str, device: str) -> Subject:
     def step() -> NetworkOutput:
         return rollout.step(maps, magnitude)
 
-    context, camera = contexts(track, torch.tensor([70])), make_camera(*case.image)
+    context, camera = track[[70]], make_camera(*case.image)
 
     @torch.no_grad()
     def frame() -> RenderOutput:

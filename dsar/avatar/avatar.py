@@ -1,5 +1,6 @@
 """The avatar: template, network and skeleton; one step of it makes one frame of posed Gaussians."""
 
+import logging
 from collections.abc import Collection
 
 import torch
@@ -11,7 +12,7 @@ from dsar.avatar.garment import beneath, fit_garment_chart
 from dsar.avatar.posing import pose_gaussians
 from dsar.avatar.stillness import stillest_frames
 from dsar.avatar.template import SHOWN, GaussianParameters
-from dsar.avatar.track import contexts, with_lags
+from dsar.avatar.track import find_jumps, make_track
 from dsar.body.atlas import Atlas, body_chart
 from dsar.body.model import PARENTS, Body
 from dsar.body.skinning import forward_kinematics
@@ -21,6 +22,7 @@ from dsar.network import STREAMS, DualStreamNetwork, NetworkOutput, NetworkState
 from dsar.network.maps import FrameMaps, maps_from_points
 from dsar.types import Capture, Gaussians, Motion
 
+_log = logging.getLogger(__name__)
 GARMENT_FRAMES = 12
 """Still frames whose masks shape the garment chart."""
 
@@ -125,11 +127,16 @@ class Avatar(nn.Module):
         """Gaussians of every frame."""
         return len(self.texels)
 
-    def track(self, motion: Motion) -> Float[Tensor, "f k j 4 4"]:
+    def track(self, motion: Motion) -> Float[Tensor, "f t j 4 4"]:
         """Return the track of a motion."""
         poses = motion.rotations.to(self.body_joints), motion.translations.to(self.body_joints)
-        transforms = forward_kinematics(self.body, *poses)
-        return with_lags(transforms, self.body_joints[0], motion.fps, self.model.lags)
+        transforms, pelvis = forward_kinematics(self.body, *poses), self.body_joints[0]
+        for frame in find_jumps(transforms, pelvis, motion.fps):
+            seconds = frame / motion.fps
+            _log.warning(
+                "Motion %s: the body jumps after %.2f s; its clothes go with it", motion.name, seconds
+            )
+        return make_track(transforms, pelvis, motion.fps, self.model.lags)
 
     def start(self, batch: int = 1) -> NetworkState:
         """Return the state of rollouts that have seen nothing yet."""
@@ -159,12 +166,12 @@ class Avatar(nn.Module):
         )
 
     @torch.no_grad()
-    def measure_maps(self, tracks: list[Float[Tensor, "_ k j 4 4"]]) -> None:
+    def measure_maps(self, tracks: list[Float[Tensor, "_ t j 4 4"]]) -> None:
         """Set the statistics that standardise input maps from training motions."""
         maps, speeds = [], []
         for track in tracks:
             for frames in torch.arange(0, len(track), 4).split(16):
-                observed = self.maps(contexts(track, frames), self.fps)
+                observed = self.maps(track[frames], self.fps)
                 maps.append(observed.maps.flatten(2)[:, :, self.cells])
                 speeds.append(observed.speed.flatten(2)[:, :, self.cells])
         values = torch.cat(maps)

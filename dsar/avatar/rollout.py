@@ -8,7 +8,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dsar.avatar.avatar import Avatar
-from dsar.avatar.track import contexts
 from dsar.errors import MotionError
 from dsar.network import STREAMS, NetworkOutput, Stream
 from dsar.network.streaming import Rollout
@@ -64,7 +63,7 @@ def template_sequence(sequence: GaussianSequence, avatar: Avatar, motion: Motion
     @torch.no_grad()
     def produce() -> Iterator[Gaussians]:
         for number in sequence.frame_numbers:
-            yield avatar.gaussians(contexts(track, torch.tensor([number - START_FRAME])), None)[0]
+            yield avatar.gaussians(track[[number - START_FRAME]], None)[0]
 
     return dataclasses.replace(sequence, produce=produce)
 
@@ -80,7 +79,7 @@ def network_outputs(
     rollout = Rollout(avatar.network, streams, torch.bfloat16 if track.is_cuda else None)
     for frame in range(len(track)):
         with torch.no_grad():
-            context = contexts(track, torch.tensor([frame]))
+            context = track[[frame]]
             output = rollout.step(*avatar.standardized(avatar.maps(context, avatar.fps)))
         yield context, output
 

@@ -18,7 +18,6 @@ from torch import Tensor
 
 from dsar.avatar.avatar import Avatar
 from dsar.avatar.rollout import START_FRAME, roll_out
-from dsar.avatar.track import contexts
 from dsar.data.native import NativeCapture
 from dsar.evaluation.garment import measure_garment
 from dsar.evaluation.metrics import ImageMetric, correlation, load_perceptual, psnr
@@ -80,7 +79,7 @@ def evaluate_sequence(
     for number, gaussians in roll_out(avatar, motion, streams=streams):
         frame = number - START_FRAME
         if frame % stride == 0:
-            template = avatar.gaussians(contexts(track, torch.tensor([frame])), None)[0]
+            template = avatar.gaussians(track[[frame]], None)[0]
             for index, camera in enumerate(capture.cameras):
                 truth = true_view(capture, sequence, frame, index)
                 image = render_white(gaussians, camera)
@@ -161,7 +160,7 @@ def time_rollout(avatar: Avatar, capture: Capture, sequence: str, frames: int = 
     times: dict[str, list[float]] = defaultdict(list)
     for frame in range(min(frames, len(track))):
         start = read_clock()
-        context = contexts(track, torch.tensor([frame]))
+        context = track[[frame]]
         maps, magnitude = avatar.standardized(avatar.maps(context, avatar.fps))
         seen = read_clock()
         step = partial(rollout.step, maps, magnitude)

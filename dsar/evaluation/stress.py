@@ -15,7 +15,6 @@ from torch import Tensor
 
 from dsar.avatar.avatar import Avatar
 from dsar.avatar.rollout import network_outputs
-from dsar.avatar.track import contexts
 from dsar.data.motion import resample
 from dsar.evaluation.drills import spin_and_stop, swaying, swerving, teleported
 from dsar.evaluation.horizon import looped
@@ -92,6 +91,7 @@ def run_cycle(avatar: Avatar, motion: Motion, cycles: int = 100) -> Verdict:
     return Verdict(_finite(apart[4:].median()), 0.5, "mm", _curve(apart))
 
 
+@torch.no_grad()
 def run_twin(avatar: Avatar, motion: Motion, start: int = 30) -> Verdict:
     """Two rollouts, one of which is put wrong at a frame: seconds until they are 1 mm (rms) apart for good.
 
@@ -106,7 +106,7 @@ def run_twin(avatar: Avatar, motion: Motion, start: int = 30) -> Verdict:
             memory, offsets = state.memory[1], state.offsets[1]
             memory.copy_(torch.randn(memory.shape, generator=generator) * memory.square().mean().sqrt())
             offsets.add_(_NOISE * torch.randn(offsets.shape, generator=generator))
-        context = contexts(track, torch.tensor([frame]))
+        context = track[[frame]]
         output, state, _ = avatar.advance(context.expand(2, -1, -1, -1, -1), state)
         if frame >= start:
             apart.append(_distance(*_at_control_points(avatar, output)))

@@ -15,7 +15,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dsar.avatar.avatar import Avatar, blend
-from dsar.avatar.track import contexts
 from dsar.config import ScheduleConfig, TrainConfig
 from dsar.geometry.cameras import project
 from dsar.network import NetworkOutput
@@ -59,7 +58,7 @@ class Registration:
         config: TrainConfig,
         capture: Capture,
         avatar: Avatar,
-        tracks: Mapping[str, Float[Tensor, "_ k j 4 4"]],
+        tracks: Mapping[str, Float[Tensor, "_ t j 4 4"]],
         clips: Mapping[str, range],
     ) -> None:
         """Prepare to fit the frames of `clips`, of which each worker gets its share."""
@@ -127,7 +126,7 @@ class Registration:
     def fit(self, name: str, frame: int) -> Progress:
         """Fit the map of a frame; those of the frames before it are fitted."""
         rng = np.random.default_rng([self.seed, self.order.index(name), frame])
-        context = contexts(self.tracks[name], torch.tensor([frame]))
+        context = self.tracks[name][[frame]]
         guesses, fast = self._guesses(context, name, frame)
         points = self._posed(context, self._map(guesses[0]))
         view = functools.cache(functools.partial(self._view, name, frame, points=points))
@@ -181,9 +180,7 @@ class Registration:
     def _inertia(self, context: Tensor, name: str, frame: int) -> Float[Tensor, "g 3"]:
         """Return the offsets of cloth that moves on through the world as it did before this frame."""
         avatar, garment, maps, track = self.avatar, self.garment, self.maps[name], self.tracks[name]
-        newest, older = (
-            self._posed(contexts(track, torch.tensor([f])), maps[f : f + 1]) for f in (frame - 1, frame - 2)
-        )
+        newest, older = (self._posed(track[[f]], maps[f : f + 1]) for f in (frame - 1, frame - 2))
         moved = newest + self._smooth(newest - older)
         blended = blend(avatar.control_weights[garment], context[:, :1])[0, 0]
         points = torch.linalg.solve(blended[..., :3], (moved - blended[..., 3])[..., None])[..., 0]

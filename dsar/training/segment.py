@@ -12,7 +12,6 @@ from torch import Tensor, nn
 
 from dsar.avatar.avatar import Avatar
 from dsar.avatar.mirror import Mirror, mirror_motion
-from dsar.avatar.track import contexts
 from dsar.config import TrainConfig
 from dsar.errors import TrainingError
 from dsar.network import STREAMS, NetworkOutput, NetworkState, Stream
@@ -92,7 +91,7 @@ class SegmentTrainer:
         loss, mse = torch.zeros(()), torch.zeros(())
         for index in rng.choice(len(still), TEMPLATE_FRAMES):
             name, frame = still[index]
-            context = contexts(self.tracks[name], torch.tensor([frame]))
+            context = self.tracks[name][[frame]]
             gaussians = self.avatar.gaussians(context, None)[0]
             view = self._views(rng, gaussians, name, frame, reduction)
             loss, mse = loss + view[0], mse + view[1]
@@ -143,9 +142,7 @@ class SegmentTrainer:
         """Advance every rollout by one frame."""
         places, fresh = self.streams.next_frames(rng, horizon)
         self.state = self.state.restart(torch.tensor(fresh))
-        seen = context = torch.cat(
-            [contexts(self.tracks[p.sequence], torch.tensor([p.frame])) for p in places]
-        )
+        seen = context = torch.stack([self.tracks[p.sequence][p.frame] for p in places])
         mirrored = torch.tensor([place.mirrored for place in places])
         if self.mirror is not None:
             seen = torch.where(mirrored[:, None, None, None, None], mirror_motion(context), context)

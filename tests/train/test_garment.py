@@ -7,7 +7,6 @@ from scipy.ndimage import minimum_filter
 
 from dsar.avatar.avatar import Avatar
 from dsar.avatar.garment import loose_extent
-from dsar.avatar.track import contexts
 from dsar.config import AtlasConfig, TrainConfig
 from dsar.data.capture import open_capture
 from dsar.raster import rasterize
@@ -131,7 +130,7 @@ def test_one_fitted_frame_covers_the_mask(capture, sequence, frame):
         optimizers["adam"].step()
     solid_recall, soft_recall = [], []
     with torch.no_grad():
-        gaussians = avatar.gaussians(contexts(trainer.tracks[sequence], torch.tensor([frame])), None)[0]
+        gaussians = avatar.gaussians(trainer.tracks[sequence][[frame]], None)[0]
         for index, camera in enumerate(capture.cameras):
             truth = torch.tensor(capture.image(sequence, frame, index)[..., 3]) / 255
             alpha = rasterize(gaussians, camera).alpha

@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from dsar.avatar.avatar import Avatar
-from dsar.avatar.track import contexts
 from dsar.config import ModelConfig, TrainConfig
 from dsar.data.capture import open_capture
 from dsar.training import loop
@@ -53,7 +52,7 @@ def registered():
 
 
 def distance_to_cloth(capture, avatar, registration, maps) -> float:
-    context = contexts(avatar.track(capture.motions[SEQUENCE]), torch.tensor([LAST]))
+    context = avatar.track(capture.motions[SEQUENCE])[[LAST]]
     points = registration._posed(context, maps)
     cloth = torch.from_numpy(np.asarray(capture.garment(SEQUENCE)[LAST])).float()
     return float(torch.cdist(points, cloth).amin(1).mean())

@@ -7,7 +7,6 @@ import torch
 
 from dsar.avatar.avatar import Avatar
 from dsar.avatar.rollout import network_outputs, roll_out
-from dsar.avatar.track import contexts
 from dsar.body.atlas import Atlas, body_chart
 from dsar.body.files import load_body
 from dsar.config import ModelConfig
@@ -113,7 +112,7 @@ def test_maps_that_are_switched_off_leave_the_others_and_the_speed_as_they_are(s
     seen = []
     for model in (config, dataclasses.replace(config, **{setting: off})):
         avatar = Avatar(body, atlas, model, 30.0)
-        context = contexts(avatar.track(dance(20)), torch.arange(5, 15))
+        context = avatar.track(dance(20))[5:15]
         seen.append(avatar.maps(context, 30.0))
         assert seen[-1].maps.shape[1] == model.map_channels
     full, less = seen

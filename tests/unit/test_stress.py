@@ -1,0 +1,143 @@
+"""The stability battery finds what is wrong with rollouts whose faults are known."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+
+from dsar.avatar.avatar import Avatar
+from dsar.body.atlas import Atlas, body_chart
+from dsar.body.files import load_body
+from dsar.config import ModelConfig
+from dsar.evaluation import stress as battery
+from dsar.evaluation.drills import spin_and_stop, swaying
+from dsar.network import NetworkOutput
+from dsar.types import Motion
+
+FPS = 30.0
+
+
+@pytest.fixture(scope="module")
+def avatar():
+    torch.manual_seed(0)
+    config = ModelConfig(channels=(4, 8), heads=2, window=3, memory=2)
+    made = Avatar(load_body(), Atlas.stack([body_chart(load_body(), 16)]), config, FPS).eval()
+    torch.nn.init.normal_(made.network.decoder.head.weight, std=0.2)
+    return made
+
+
+@pytest.fixture(scope="module")
+def motion():
+    rotations = 0.2 * torch.sin(torch.arange(40)[:, None, None] / 8 + torch.arange(3.0)).repeat(1, 55, 1)
+    return Motion(rotations, torch.zeros(40, 3), FPS, "wave")
+
+
+@pytest.fixture
+def pretend(monkeypatch):
+    """Return a function that puts offsets (metres, alike everywhere) in the place of the network's."""
+
+    def put(offset):
+        def outputs(avatar, motion):
+            for frame in range(len(motion)):
+                value = torch.tensor(offset(frame)).expand(1, 3, *avatar.grid_size)
+                yield None, NetworkOutput(value.clone(), torch.zeros(1, 11, *avatar.grid_size), ())
+
+        monkeypatch.setattr(battery, "network_outputs", outputs)
+
+    return put
+
+
+def test_drift_is_measured_per_thousand_frames(avatar, motion, pretend):
+    # 0.1 m at first, 0.3 m after 10,000 frames: 0.02 m per 1000 over a mean of 0.2 m.
+    pretend(lambda frame: 0.1 + 0.2 * frame / 10_000)
+    verdict = battery.run_long(avatar, motion)
+    assert verdict.value == pytest.approx(0.1, rel=0.02)
+    assert not verdict.passed
+    pretend(lambda frame: 0.1 + 0.02 * math.sin(frame))
+    assert battery.run_long(avatar, motion).passed
+    pretend(lambda frame: 0.1 if frame != 77 else math.nan)
+    assert battery.run_long(avatar, motion).value == math.inf
+    assert battery.run_long(avatar, motion).to_json()["value"] is None
+
+
+def test_a_cycle_must_come_back_to_where_it_was(avatar, motion, pretend):
+    pretend(lambda frame: 0.1 * math.sin(math.pi * frame / 30))
+    assert battery.run_cycle(avatar, motion).value == pytest.approx(0, abs=1e-3)
+    # 60 frames a cycle, a micrometre each along three axes.
+    pretend(lambda frame: frame * 1e-5)
+    assert battery.run_cycle(avatar, motion).value == pytest.approx(60 * 0.01 * 3**0.5, rel=1e-3)
+
+
+def test_cloth_must_move_on_after_a_stop_and_then_come_to_rest(avatar, motion, pretend):
+    stop = spin_and_stop(motion)[1]
+
+    def cloth(seconds):
+        def offset(frame):
+            after = max(frame - stop, 0) / FPS
+            return 0.1 * math.sin(frame / 10) if frame <= stop else 0.05 * math.exp(-after / seconds)
+
+        return offset
+
+    pretend(cloth(0.4))
+    verdict = battery.run_stop(avatar, motion)
+    assert verdict.passed
+    assert verdict.value == pytest.approx(50 * 3**0.5 * math.exp(-3 / 0.4), rel=0.05)
+    pretend(cloth(1.0))
+    assert not battery.run_stop(avatar, motion).passed
+    pretend(cloth(0.001))
+    assert battery.run_stop(avatar, motion).value < 1e-6
+    assert not battery.run_stop(avatar, motion).present
+
+
+def test_a_rollout_that_sees_the_future_is_caught(avatar, motion, monkeypatch):
+    assert battery.run_causal(avatar, motion).passed
+    honest = battery.network_outputs
+
+    def peeking(avatar, motion):
+        for context, output in honest(avatar, motion):
+            yield context, dataclasses.replace(output, offset=output.offset + motion.rotations.mean())
+
+    monkeypatch.setattr(battery, "network_outputs", peeking)
+    assert not battery.run_causal(avatar, motion).passed
+
+
+def test_twins_meet_where_the_state_is_forgotten_and_only_there(avatar, motion):
+    assert battery.run_twin(avatar, motion).curve[0] > 0
+    blind = Avatar(load_body(), Atlas.stack([body_chart(load_body(), 16)]), avatar.model, FPS).eval()
+    assert battery.run_twin(blind, motion).value == 0
+
+    class Elephant(Avatar):
+        """Never forgets: adds its previous offset to the next."""
+
+        def advance(self, context, state, **streams):
+            output, after, maps = super().advance(context, state, **streams)
+            offset = output.offset + state.offsets[:, -1]
+            after = dataclasses.replace(after, offsets=torch.cat([after.offsets[:, 1:], offset[:, None]], 1))
+            return dataclasses.replace(output, offset=offset), after, maps
+
+    blind.__class__ = Elephant
+    verdict = battery.run_twin(blind, motion)
+    assert not verdict.passed
+    # 2 cm along each of three axes, at a handful of points.
+    assert verdict.curve[-1] == verdict.curve[0] == pytest.approx(20 * 3**0.5, rel=0.5)
+
+
+def test_a_jump_of_the_body_does_not_reach_its_clothes(avatar, motion):
+    verdict = battery.run_teleport(avatar, motion)
+    assert verdict.curve[len(motion) // 2 - 1] == 0
+    assert verdict.value < 0.1 * max(battery.run_causal(avatar, motion).curve)
+
+
+def test_other_rates_of_the_same_motion_are_compared_at_the_avatar_s(avatar, motion):
+    verdict = battery.run_rate(avatar, motion)
+    assert verdict.curve[0] > 0
+    assert max(verdict.curve[1:]) < 1e-2
+    assert verdict.value == pytest.approx(verdict.curve[0], abs=1e-4)
+
+
+def test_a_sway_is_periodic_and_begins_at_rest(motion):
+    sway, period = swaying(motion, 4)
+    assert period == 60
+    torch.testing.assert_close(sway.rotations[0], motion.rotations[0])
+    torch.testing.assert_close(sway.rotations[60:120], sway.rotations[120:180], atol=1e-5, rtol=0)
