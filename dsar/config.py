@@ -167,7 +167,7 @@ class ScheduleConfig:
     0: whole clips from the start (a rollout that starts cold in mid-motion teaches the wrong thing)."""
     learning_rate: float = 2e-3
     """Peak rate of Adam for the network; cosine to 2 % of it."""
-    matrix_rate: float = 0.02
+    matrix_rate: float = 0.01
     """Peak rate of Muon for the network's hidden convolutions, same cosine;
     0: Adam trains them too (the paper's)."""
     warmup: float = 0.03
