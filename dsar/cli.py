@@ -279,13 +279,45 @@ class Render(Drive):
 
 @dataclass(frozen=True)
 class Eval(Common):
-    """Measure a run on the frames it never saw."""
+    """Measure a run on the frames it never saw; or train and measure the models of the paper's tables."""
 
     run_folder: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(name="run")] = None
     """Run folder; default: the newest under runs/."""
+    ablations: bool = False
+    """The paper's ablations instead of a run: trained, measured, and set beside the paper's figures."""
+    baselines: bool = False
+    """The paradigms of other systems, likewise."""
+    capture: str = "embedded"
+    """What tables are made on: a capture folder, or `embedded`."""
+    minutes: float = 10
+    """Training of each of a table's models."""
+    hours: float | None = None
+    """Stop before this time is over; the same command goes on with what is missing."""
+    study: Path = Path("runs/study")
+    """Folder of the tables' models; what it holds is not done again."""
 
     def run(self) -> None:
         """Measure and print the figures."""
+        if self.ablations or self.baselines:
+            self.run_study()
+        else:
+            self.run_heldout()
+
+    def run_study(self) -> None:
+        """Train and measure what the tables lack; print them."""
+        from dsar.evaluation.study import ABLATIONS, BASELINES, Study, summarize_tables, to_markdown
+
+        self.check_device()
+        tables = (ABLATIONS if self.ablations else {}) | (BASELINES if self.baselines else {})
+        study = Study(self.study, self.minutes, self.capture)
+        with Bar(self.progress, "study").running() as bar:
+            complete = study.run(list(tables.values()), self.hours, lambda what, share: bar.show(share, what))
+        summary = summarize_tables(study, tables)
+        self.write_json({"complete": complete, "minutes": self.minutes, "tables": summary})
+        sys.stdout.write(to_markdown(summary))
+
+    def run_heldout(self) -> None:
+        """Measure one run."""
         from dsar.data.capture import open_capture
         from dsar.evaluation.heldout import evaluate
         from dsar.training.checkpoint import Run, load_checkpoint, newest_run

@@ -176,14 +176,19 @@ def time_rollout(avatar: Avatar, capture: Capture, sequence: str, frames: int = 
     return {name: statistics.median(values) for name, values in times.items()}
 
 
-def evaluate(avatar: Avatar, capture: NativeCapture, *, stride: int = 2) -> dict[str, Any]:
-    """Return the held-out figures of a run in the shape of the command-line contract."""
+def evaluate(
+    avatar: Avatar, capture: NativeCapture, *, stride: int = 2, streams: Collection[Stream] = STREAMS
+) -> dict[str, Any]:
+    """Return the held-out figures of a run in the shape of the command-line contract.
+
+    Without one of the `streams` images are those of an ablated network; garment and times are the whole's.
+    """
     splits: dict[str, Any] = {}
     perceptual, skipped = load_perceptual()
     strides = dict.fromkeys(capture.splits["train"], 8 * stride)
     strides |= dict.fromkeys(capture.splits["test"], stride)
     by_sequence = {
-        name: evaluate_sequence(avatar, capture, name, each, perceptual=perceptual)
+        name: evaluate_sequence(avatar, capture, name, each, streams=streams, perceptual=perceptual)
         for name, each in strides.items()
     }
     for split in ("train", "test", "nd", "fd"):
@@ -199,7 +204,7 @@ def evaluate(avatar: Avatar, capture: NativeCapture, *, stride: int = 2) -> dict
         "ms": milliseconds,
         "gaussians": avatar.num_gaussians,
         "parameters": sum(p.numel() for p in avatar.network.parameters()),
-        "one_to_many": one_to_many(avatar, capture),
+        "one_to_many": one_to_many(avatar, capture, streams=streams),
         "garment": garments,
         "skipped": skipped | dict.fromkeys(("mmd", "psnr_garment"), "not measured by this version"),
     }

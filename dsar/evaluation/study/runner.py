@@ -1,0 +1,168 @@
+"""Train and measure the models of some tables, one after the other; what is done is never done again."""
+
+import dataclasses
+import json
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from dsar.config import PRESETS, TrainConfig, config_from_json
+from dsar.data.capture import open_capture
+from dsar.errors import ConfigError
+from dsar.evaluation.heldout import evaluate
+from dsar.evaluation.stress import stress
+from dsar.evaluation.study.tables import Row, Table
+from dsar.network import STREAMS
+from dsar.training.checkpoint import Run, load_checkpoint, read_progress
+from dsar.training.loop import train
+from dsar.training.report import Report
+
+_MEASURING = 5
+"""Minutes that measuring a model takes on two cores, about."""
+_ENOUGH = 1_000_000
+"""Updates that no budget of minutes reaches."""
+Reporter = Callable[[str, float], None]
+"""Is told what is being done, and the share of the study that is done."""
+
+
+@dataclass(frozen=True)
+class Model:
+    """One network to train: a row's settings with a seed."""
+
+    settings: Mapping[str, Any]
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """A name for its folder that says how it differs."""
+        parts = [f"{key.rpartition('.')[2]}={_short(value)}" for key, value in sorted(self.settings.items())]
+        return ",".join([*(parts or ["full"]), f"seed={self.seed}"])
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """A model, and the streams that it is measured without."""
+
+    model: Model
+    zeroed: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Study:
+    """A folder of models that were trained for equally long on one capture."""
+
+    folder: Path
+    """Holds a run folder a model, with its figures."""
+    minutes: float
+    """Budget of each model's training."""
+    capture: str = "embedded"
+    """A capture folder, or `embedded`."""
+    preset: str = "demo"
+    """What the settings of a row start from."""
+
+    def measurements(self, tables: Sequence[Table]) -> list[Measurement]:
+        """Return what the tables need, first seeds first."""
+        rows = [row for table in tables for row in table.rows]
+        wanted = [
+            Measurement(Model(row.settings, seed), row.zeroed) for row in rows for seed in range(row.seeds)
+        ]
+        unique = {self._figures(each): each for each in wanted}.values()
+        return sorted(unique, key=lambda each: each.model.seed)
+
+    def config(self, model: Model) -> TrainConfig:
+        """Return the settings of a model's run.
+
+        Raises:
+            ConfigError: a row names a setting that does not exist, or settings contradict each other.
+        """
+        config = PRESETS[self.preset]
+        schedule = dataclasses.replace(config.schedule, steps=_ENOUGH, minutes=self.minutes)
+        config = dataclasses.replace(config, capture=self.capture, seed=model.seed, schedule=schedule)
+        for key, value in model.settings.items():
+            section, _, name = key.rpartition(".")
+            owner = getattr(config, section) if section else config
+            if not hasattr(owner, name):
+                raise ConfigError(f"a row of the study names {key}, which is no setting")
+            changed = dataclasses.replace(owner, **{name: value})
+            config = dataclasses.replace(config, **{section: changed}) if section else changed
+        config.validate()
+        return config
+
+    def run(
+        self, tables: Sequence[Table], hours: float | None = None, report: Reporter = lambda *_: None
+    ) -> bool:
+        """Train and measure what is missing; return whether all of it is there.
+
+        With `hours` nothing is begun that would likely take longer. An interrupted model goes on.
+        """
+        began, needed = time.monotonic(), self.measurements(tables)
+        for done, each in enumerate(needed):
+            if self._figures(each).exists():
+                continue
+            if not self._trained(each.model):
+                if hours is not None and time.monotonic() - began > 3600 * hours - 60 * self._expected:
+                    return False
+                run, what = self._run(each.model), f"train {each.model.name}"
+                follow = partial(_follow, report, what, done, len(needed))
+                train(self.config(each.model), run, resume=run.exists, report=follow)
+            report(f"measure {each.model.name}", done / len(needed))
+            self._measure(each)
+        report("done", 1.0)
+        return True
+
+    def figures(self, row: Row) -> list[dict[str, Any]]:
+        """Return what was found of a row, a dictionary a seed; seeds that are missing are left out."""
+        each = (Measurement(Model(row.settings, seed), row.zeroed) for seed in range(row.seeds))
+        paths = [self._figures(one) for one in each]
+        return [json.loads(path.read_text()) for path in paths if path.exists()]
+
+    @property
+    def _expected(self) -> float:
+        """Minutes that a model takes."""
+        return self.minutes + _MEASURING
+
+    def _run(self, model: Model) -> Run:
+        return Run(self.folder / model.name)
+
+    def _figures(self, each: Measurement) -> Path:
+        suffix = "".join(f"-without-{stream}" for stream in each.zeroed)
+        return self._run(each.model).folder / f"figures{suffix}.json"
+
+    def _trained(self, model: Model) -> bool:
+        run = self._run(model)
+        if run.exists and config_from_json(run.config) != self.config(model):
+            raise ConfigError(
+                f"{run.folder} was trained with other settings than this study's ({self.minutes:g} minutes, "
+                f"preset {self.preset}, this version's defaults); give the study another folder"
+            )
+        return run.exists and read_progress(run)["progress"] >= 1
+
+    def _measure(self, each: Measurement) -> None:
+        model, run = each.model, self._run(each.model)
+        avatar, config, provenance = load_checkpoint(run)
+        capture = open_capture(config.capture)
+        streams = tuple(stream for stream in STREAMS if stream not in each.zeroed)
+        found = {"settings": dict(model.settings), "seed": model.seed, "minutes": self.minutes, **provenance}
+        found |= {"updates": read_progress(run)["step"], **evaluate(avatar, capture, streams=streams)}
+        if not each.zeroed:
+            far = (capture.splits.get("fd") or capture.splits["test"])[0]
+            verdicts = stress(avatar, capture.motions[far])
+            found["stress"] = {name: verdict.to_json() for name, verdict in verdicts}
+        path = self._figures(each)
+        draft = path.with_suffix(".tmp")
+        draft.write_text(json.dumps(found, indent=1) + "\n")
+        os.replace(draft, path)
+
+
+def _follow(report: Reporter, what: str, done: int, needed: int, line: Report) -> None:
+    report(what, (done + line.progress) / needed)
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, bool):
+        return "on" if value else "off"
+    return "-".join(map(str, value)) or "none" if isinstance(value, tuple) else str(value)

@@ -1,0 +1,76 @@
+"""The study's tables as numbers and as text."""
+
+import statistics
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from dsar.evaluation.study.runner import Study
+from dsar.evaluation.study.tables import Row, Table
+
+_IMAGE = ("psnr", "psnr_box", "ssim", "lpips", "flip", "tpsnr")
+_COLUMNS = (*_IMAGE, "correlation", "fps", "passed", "updates")
+_DIGITS = {"ssim": 4, "lpips": 4, "flip": 4, "fps": 0, "passed": 0, "updates": 0}
+
+
+def summarize_tables(study: Study, tables: Mapping[str, Table]) -> dict[str, Any]:
+    """Return each table: its rows, with means over seeds, how far seeds part, and the paper's figures."""
+    return {
+        name: {
+            "title": table.title,
+            "split": table.split,
+            "rows": [_summarize(row, study.figures(row), table.split) for row in table.rows],
+        }
+        for name, table in tables.items()
+    }
+
+
+def _summarize(row: Row, found: Sequence[Mapping[str, Any]], split: str) -> dict[str, Any]:
+    seen = [_numbers(figures, split) for figures in found]
+    values = {key: [each[key] for each in seen if each[key] is not None] for key in _COLUMNS}
+    return {
+        "label": row.label,
+        "settings": dict(row.settings),
+        "zeroed": list(row.zeroed),
+        "seeds": [figures["seed"] for figures in found],
+        "mean": {key: statistics.fmean(v) if v else None for key, v in values.items()},
+        "spread": {key: max(v) - min(v) if len(v) > 1 else None for key, v in values.items()},
+        "paper": dict(row.paper),
+    }
+
+
+def _numbers(figures: Mapping[str, Any], split: str) -> dict[str, float | None]:
+    """Return a model's columns; those that were not measured are null."""
+    # A capture that labels no sequence as far has its test split judged in its place.
+    images = figures["splits"].get(split) or figures["splits"]["test"]
+    pairs, battery = figures["one_to_many"], figures.get("stress")
+    return {key: images[key] for key in _IMAGE} | {
+        "correlation": pairs and pairs["correlation"],
+        "fps": figures["fps"],
+        "passed": None if battery is None else sum(case["pass"] for case in battery.values()),
+        "updates": figures["updates"],
+    }
+
+
+def to_markdown(summary: Mapping[str, Any]) -> str:
+    """Return the tables as Markdown: ours with the spread over seeds, and the paper's beside them."""
+    parts = []
+    for table in summary.values():
+        paper = [key for key in _IMAGE if any(key in row["paper"] for row in table["rows"])]
+        head = ["", "seeds", *_COLUMNS, *(f"paper {key}" for key in paper)]
+        lines = [f"### {table['title']}", "", _line(head), _line(["---"] * len(head))]
+        for row in table["rows"]:
+            cells = [_cell(row["mean"][key], row["spread"][key], _DIGITS.get(key, 2)) for key in _COLUMNS]
+            theirs = [_cell(row["paper"].get(key), None, _DIGITS.get(key, 2)) for key in paper]
+            lines.append(_line([row["label"], str(len(row["seeds"])), *cells, *theirs]))
+        parts.append("\n".join(lines))
+    return "\n\n".join(parts) + "\n"
+
+
+def _cell(value: float | None, spread: float | None, digits: int) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.{digits}f}" + (f" ±{spread / 2:.{digits}f}" if spread is not None else "")
+
+
+def _line(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"

@@ -1,0 +1,83 @@
+"""The study: every row is a model that can be built; what is done is not done again; tables say what is."""
+
+import json
+
+import pytest
+
+from dsar.errors import ConfigError
+from dsar.evaluation.stress import run_causal
+from dsar.evaluation.study import (
+    ABLATIONS,
+    BASELINES,
+    Row,
+    Study,
+    Table,
+    runner,
+    summarize_tables,
+    to_markdown,
+)
+
+TINY = {
+    "tiny": Table(
+        "Tiny",
+        (
+            Row("full", paper={"psnr": 30.0}),
+            Row("no feedback", {"model.feedback": 0}),
+            Row("full, bank zeroed", zeroed=("state",)),
+        ),
+    )
+}
+
+
+def test_every_row_of_the_tables_is_a_model_that_can_be_trained(tmp_path):
+    study = Study(tmp_path, 10)
+    tables = [*ABLATIONS.values(), *BASELINES.values()]
+    measurements = study.measurements(tables)
+    configs = {each.model.name: study.config(each.model) for each in measurements}
+    # Models that differ have names that differ, and folders of their own.
+    assert len({json.dumps(vars(config), default=vars) for config in configs.values()}) == len(configs)
+    assert configs["feedback=0,seed=2"].model.feedback == 0
+    assert configs["feedback=0,seed=2"].seed == 2
+    assert configs["cameras=4,seed=0"].cameras == 4
+    assert [each.model.seed for each in measurements] == sorted(each.model.seed for each in measurements)
+
+
+def test_a_row_that_names_no_setting_is_refused(tmp_path):
+    study = Study(tmp_path, 10)
+    with pytest.raises(ConfigError, match=r"model\.windows"):
+        study.config(runner.Model({"model.windows": 3}, 0))
+
+
+def test_a_study_goes_on_with_what_is_missing_and_does_nothing_twice(tiny_capture, tmp_path, monkeypatch):
+    monkeypatch.setattr(runner, "stress", lambda *of: iter([("causal", run_causal(*of))]))
+    study, tables = Study(tmp_path, 0.05, str(tiny_capture)), list(TINY.values())
+    # An hour's budget of none: nothing is begun.
+    assert not study.run(tables, hours=0.0)
+    assert summarize_tables(study, TINY)["tiny"]["rows"][0]["seeds"] == []
+    told = []
+    assert study.run(tables, report=lambda *what: told.append(what))
+    assert {what for what, _ in told} == {
+        "train full,seed=0",
+        "measure full,seed=0",
+        "train feedback=0,seed=0",
+        "measure feedback=0,seed=0",
+        "done",
+    }
+    assert [share for _, share in told] == sorted(share for _, share in told)
+    told.clear()
+    assert study.run(tables, hours=0.0, report=lambda *what: told.append(what))
+    assert told == [("done", 1.0)]
+    (tmp_path / "feedback=0,seed=0" / "figures.json").unlink()
+    with pytest.raises(ConfigError, match="other settings"):
+        Study(tmp_path, 0.1, str(tiny_capture)).run(tables)
+
+    summary = summarize_tables(study, TINY)
+    full, less, zeroed = summary["tiny"]["rows"]
+    assert full["seeds"] == zeroed["seeds"] == [0]
+    assert less["seeds"] == []
+    assert full["mean"]["passed"] == 1
+    assert full["mean"]["psnr"] != zeroed["mean"]["psnr"]
+    text = to_markdown(summary)
+    assert f"| full | 1 | {full['mean']['psnr']:.2f} |" in text
+    assert text.splitlines()[2].endswith("| paper psnr |")
+    assert text.splitlines()[4].endswith("| 30.00 |")
