@@ -289,7 +289,7 @@ class Eval(Common):
     """The paradigms of other systems, likewise."""
     capture: str = "embedded"
     """What tables are made on: a capture folder, or `embedded`."""
-    minutes: float = 10
+    minutes: float = 10.0
     """Training of each of a table's models."""
     hours: float | None = None
     """Stop before this time is over; the same command goes on with what is missing."""

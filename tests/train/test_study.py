@@ -30,7 +30,7 @@ TINY = {
 
 
 def test_every_row_of_the_tables_is_a_model_that_can_be_trained(tmp_path):
-    study = Study(tmp_path, 10)
+    study = Study(tmp_path, 10.0)
     tables = [*ABLATIONS.values(), *BASELINES.values()]
     measurements = study.measurements(tables)
     configs = {each.model.name: study.config(each.model) for each in measurements}
@@ -43,7 +43,7 @@ def test_every_row_of_the_tables_is_a_model_that_can_be_trained(tmp_path):
 
 
 def test_a_row_that_names_no_setting_is_refused(tmp_path):
-    study = Study(tmp_path, 10)
+    study = Study(tmp_path, 10.0)
     with pytest.raises(ConfigError, match=r"model\.windows"):
         study.config(runner.Model({"model.windows": 3}, 0))
 

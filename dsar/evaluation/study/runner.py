@@ -109,7 +109,7 @@ class Study:
                 run, what = self._run(each.model), f"train {each.model.name}"
                 follow = partial(_follow, report, what, done, len(needed))
                 train(self.config(each.model), run, resume=run.exists, report=follow)
-            report(f"measure {each.model.name}", done / len(needed))
+            report(f"measure {each.model.name}", (done + 1) / len(needed))
             self._measure(each)
         report("done", 1.0)
         return True
@@ -159,7 +159,7 @@ class Study:
 
 
 def _follow(report: Reporter, what: str, done: int, needed: int, line: Report) -> None:
-    report(what, (done + line.progress) / needed)
+    report(what, (done + min(line.progress, 1.0)) / needed)
 
 
 def _short(value: Any) -> str:
