@@ -114,7 +114,7 @@ def _train(config: TrainConfig, folder: Path, resume: bool, report: Reporter | N
             now = position(schedule, progress)
             if now.stage != "template" and not registration.complete:
                 show = partial(monitor.show, step, progress, "registration")
-                stop, used = _register(registration, gradients, received, clock, show)
+                stop, used = _register(registration, gradients, received, clock, used, show)
                 trainer.registered = registration.result
                 continue
             set_rates(optimizers, now)
@@ -142,10 +142,15 @@ def _register(
     gradients: workers.Gradients,
     received: list[int],
     clock: "Clock",
+    before: float,
     show: Callable[[float, Progress], None],
 ) -> tuple[bool, float]:
-    """Fit the registered maps; return whether a stop came before the last, and the time used so far."""
-    began = registration.used - clock.used()
+    """Fit the registered maps; return whether a stop came before the last, and the time used so far.
+
+    `before` is the time used when they were begun.
+    """
+    # Clocks differ by a little, but all workers must agree: only numbers that they share count.
+    began = registration.used - before
     registration.avatar.reveal()
     stop, used = False, 0.0
     while not (stop or registration.complete):

@@ -1,6 +1,7 @@
 """Registered maps follow the true cloth of the embedded capture, and the network learns to follow them."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -114,3 +115,37 @@ def test_a_figure_without_a_garment_is_not_registered():
     registration = Registration(config, capture, avatar, {}, {SEQUENCE: range(9)})
     assert registration.complete
     assert registration.reduced(config.schedule).imitation_share == 0
+
+
+class ThreeFrames(Registration):
+    """A registration whose frames are fitted at once."""
+
+    complete = property(lambda self: self.count == 3)
+
+    def __init__(self):
+        self.used, self.count = 0.125, 0
+        self.avatar = SimpleNamespace(reveal=lambda: None)
+
+    def advance(self):
+        self.count += 1
+
+    def share(self):
+        pass
+
+
+@pytest.mark.parametrize("behind", [0.0, 0.01])
+def test_workers_whose_clocks_differ_agree_on_the_time_that_registration_took(behind):
+    """They would part at the end of a run, one of them waiting for ever."""
+    registration = ThreeFrames()
+
+    class Late(loop.Clock):
+        def used(self):
+            return 0.5 + registration.count / 8 - behind
+
+    class Shared(Gradients):
+        def average(self, stop, used):
+            return stop, 0.5 + registration.count / 8
+
+    took = loop._register(registration, Shared([]), [], Late(1.0), 0.5, lambda *_: None)
+    assert took == (False, 0.875)
+    assert registration.used == 0.125 + 0.375
