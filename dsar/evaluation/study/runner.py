@@ -16,7 +16,7 @@ from dsar.errors import ConfigError
 from dsar.evaluation.heldout import evaluate
 from dsar.evaluation.stress import stress
 from dsar.evaluation.study.tables import Row, Table
-from dsar.network import STREAMS
+from dsar.network import STREAMS, Stream
 from dsar.training.checkpoint import Run, load_checkpoint, read_progress
 from dsar.training.loop import train
 from dsar.training.report import Report
@@ -48,7 +48,7 @@ class Measurement:
     """A model, and the streams that it is measured without."""
 
     model: Model
-    zeroed: tuple[str, ...] = ()
+    zeroed: tuple[Stream, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,7 @@ class Study:
         model, run = each.model, self._run(each.model)
         avatar, config, provenance = load_checkpoint(run)
         capture = open_capture(config.capture)
-        streams = tuple(stream for stream in STREAMS if stream not in each.zeroed)
+        streams: list[Stream] = [stream for stream in STREAMS if stream not in each.zeroed]
         found = {"settings": dict(model.settings), "seed": model.seed, "minutes": self.minutes, **provenance}
         found |= {"updates": read_progress(run)["step"], **evaluate(avatar, capture, streams=streams)}
         if not each.zeroed:

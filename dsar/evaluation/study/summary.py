@@ -26,7 +26,7 @@ def summarize_tables(study: Study, tables: Mapping[str, Table]) -> dict[str, Any
 
 def _summarize(row: Row, found: Sequence[Mapping[str, Any]], split: str) -> dict[str, Any]:
     seen = [_numbers(figures, split) for figures in found]
-    values = {key: [each[key] for each in seen if each[key] is not None] for key in _COLUMNS}
+    values = {key: [v for each in seen if (v := each[key]) is not None] for key in _COLUMNS}
     return {
         "label": row.label,
         "settings": dict(row.settings),

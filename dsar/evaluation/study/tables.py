@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from dsar.network import Stream
+
 _Settings = dict[str, Any]
 
 
@@ -22,7 +24,7 @@ class Row:
     """The paper's figures of this row, if it has it; other data, other hardware."""
     seeds: int = 1
     """Runs, each with a seed of its own."""
-    zeroed: tuple[str, ...] = ()
+    zeroed: tuple[Stream, ...] = ()
     """Streams that are taken away from the trained model when it is measured."""
 
 
