@@ -35,6 +35,8 @@ _IMAGE_METRICS = ("psnr", "psnr_box", "psnr_box_template", "psnr_garment", "ssim
 METRICS = (*_IMAGE_METRICS, "tpsnr", "warp_error", "mmd")
 """What a split has a figure of, or null."""
 _SELDOM = 4
+_MOMENT = 15
+"""Frames that look alike."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,7 @@ def evaluate_sequence(
     *,
     streams: Collection[Stream] = STREAMS,
     perceptual: Mapping[str, ImageMetric] = MappingProxyType({}),
-) -> list[dict[str, float]]:
+) -> list[dict[str, float | int]]:
     """Return the metrics of every view of every `stride`-th frame of one sequence.
 
     Of every 4th of them also those that take long: the `perceptual` ones, and those of two frames.
@@ -83,7 +85,8 @@ def evaluate_sequence(
             for index, camera in enumerate(capture.cameras):
                 truth = true_view(capture, sequence, frame, index)
                 image = render_white(gaussians, camera)
-                row = compare(image, render_white(template, camera), truth)
+                row: dict[str, float | int] = {"frame": frame, "camera": index}
+                row |= compare(image, render_white(template, camera), truth)
                 if frame % (_SELDOM * stride) == 0 and before is not None:
                     last = true_view(capture, sequence, frame - 1, index)
                     row |= compare_change((before, gaussians), camera, (last, truth))
@@ -206,12 +209,25 @@ def evaluate(
         "parameters": sum(p.numel() for p in avatar.network.parameters()),
         "one_to_many": one_to_many(avatar, capture, streams=streams),
         "garment": garments,
+        "worst": worst_views(by_sequence, capture.splits["test"]),
         "skipped": skipped | dict.fromkeys(("mmd", "psnr_garment"), "not measured by this version"),
     }
 
 
+def worst_views(
+    by_sequence: Mapping[str, Sequence[Mapping[str, float | int]]], names: Sequence[str], count: int = 8
+) -> list[dict[str, Any]]:
+    """Return the views of some sequences with the lowest PSNR in the mask's box, one of each moment."""
+    views = [{"sequence": name, **row} for name in names for row in by_sequence[name]]
+    found: dict[tuple[str, int], dict[str, Any]] = {}
+    for view in sorted(views, key=lambda view: view["psnr_box"]):
+        found.setdefault((view["sequence"], view["frame"] // _MOMENT), view)
+    keys = ("sequence", "frame", "camera", "psnr_box")
+    return [{key: view[key] for key in keys} for view in list(found.values())[:count]]
+
+
 def summarize(
-    by_sequence: Mapping[str, Sequence[Mapping[str, float]]], names: Sequence[str], views: int
+    by_sequence: Mapping[str, Sequence[Mapping[str, float | int]]], names: Sequence[str], views: int
 ) -> dict[str, float | int | None]:
     """Return means over all views of some sequences that have a figure; null where none has."""
     rows = [row for name in names for row in by_sequence[name]]

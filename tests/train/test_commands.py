@@ -3,8 +3,10 @@
 import dataclasses
 import json
 import re
+import shutil
 import subprocess
 import sys
+from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +15,14 @@ import torch
 from PIL import Image
 
 from dsar.body.files import load_body
-from dsar.cli import Train, main
+from dsar.cli import main
+from dsar.cli.train import Train
 from dsar.config import PRESETS
 from dsar.data.capture import open_capture
 from dsar.data.motion import write_motion
+from dsar.evaluation.report import write_report
+from dsar.evaluation.stress import run_causal, run_stop
+from dsar.training.checkpoint import Run
 
 
 def command(*arguments):
@@ -111,6 +117,59 @@ def test_eval_reports_what_the_contract_names(trained, tmp_path, monkeypatch):
     assert figures["fps"] > 0
 
 
+class Page(HTMLParser):
+    """Collects what a page asks the network for, its words, and whether its tags close."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.asked, self.words, self.open = [], "", []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        self.asked += [v for k, v in attributes if k in ("src", "href") and not v.startswith("data:")]
+        if tag not in ("meta", "img", "br"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if not {"script", "style"} & set(self.open):
+            self.words += data
+
+
+def test_a_run_has_a_report_that_needs_nothing_else(trained, tmp_path, monkeypatch):
+    monkeypatch.setattr("dsar.evaluation.stress.CASES", {"causal": run_causal, "stop": run_stop})
+    run = tmp_path / "<run> & more"
+    shutil.copytree(trained, run)
+    (run / "figures.json").unlink(missing_ok=True)
+    write_report(Run(run))
+    page = Page((run / "report.html").read_text())
+    assert page.asked == []
+    assert page.open == []
+    assert "<run> & more" in page.words
+    assert page.words.count("Not measured yet") == 2
+    assert "model.window" in page.words, "settings that differ from the preset's"
+
+    command("eval", run, "--json", tmp_path / "eval.json")
+    command("stress", run, "--json", tmp_path / "stress.json")
+    figures, battery = (json.loads((tmp_path / f"{name}.json").read_text()) for name in ("eval", "stress"))
+    assert figures == json.loads((run / "figures.json").read_text())
+    assert set(battery["cases"]) == {"causal", "stop"}
+    assert battery["tried"] == 2
+    assert battery["survived"] == sum(case["pass"] for case in battery["cases"].values())
+    text = (run / "report.html").read_text()
+    page = Page(text)
+    assert page.asked == []
+    assert "Not measured yet" not in page.words
+    assert f"{figures['splits']['test']['psnr_box']:.4g}" in page.words
+    assert text.count("data:image/png;base64,") == 2
+    assert text.count("data:video/mp4;base64,") == 1
+    worst = figures["worst"]
+    assert [view["psnr_box"] for view in worst] == sorted(view["psnr_box"] for view in worst)
+    assert len({(view["sequence"], view["frame"]) for view in worst}) == len(worst)
+
+
 def test_training_says_how_gradients_compare(trained):
     lines = [json.loads(line) for line in (trained / "metrics.jsonl").read_text().splitlines()]
     assert lines[0]["gradients"] is None, "the template has no regularisers"
@@ -171,7 +230,8 @@ def test_help_of_every_command_names_its_flags():
         ("train", "--model.window"),
         ("export", "--usd"),
         ("render", "--exr"),
-        ("eval", "--json"),
+        ("eval", "--ablations"),
+        ("stress", "--json"),
     ):
         shown = subprocess.run(
             [sys.executable, "-m", "dsar", name, "--help"], capture_output=True, text=True, check=True

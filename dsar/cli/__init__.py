@@ -1,0 +1,47 @@
+"""The `dsar` command: parse, build, call. Work and file formats live in the rooms that own them."""
+
+import itertools
+import logging
+import sys
+from collections.abc import Sequence
+from typing import Annotated
+
+import tyro
+
+from dsar.cli.deliver import Export, Render
+from dsar.cli.measure import Eval, Stress
+from dsar.cli.train import Train
+from dsar.config import PRESETS
+from dsar.errors import DsarError
+
+
+def parse(arguments: Sequence[str]) -> Train | Export | Render | Eval | Stress:
+    """Return the command that the arguments ask for; the preset decides the other defaults."""
+    preset = "demo"
+    for flag, value in itertools.pairwise(arguments):
+        if flag == "--preset" and value in PRESETS:
+            preset = value
+    chosen = PRESETS[preset]
+    default = Train(atlas=chosen.atlas, model=chosen.model, loss=chosen.loss, schedule=chosen.schedule)
+    commands = (
+        Annotated[Train, tyro.conf.subcommand("train", default=default)]
+        | Annotated[Export, tyro.conf.subcommand("export")]
+        | Annotated[Render, tyro.conf.subcommand("render")]
+        | Annotated[Eval, tyro.conf.subcommand("eval")]
+        | Annotated[Stress, tyro.conf.subcommand("stress")]
+    )
+    return tyro.cli(commands, args=arguments, prog="dsar", description=__doc__)  # pyright: ignore
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run a command; a DsarError becomes one line on stderr and exit code 2."""
+    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
+    command = parse(sys.argv[1:] if arguments is None else arguments)
+    try:
+        command.run()
+    except DsarError as error:
+        sys.stderr.write(f"dsar: {error}\n")
+        raise SystemExit(2) from error
+    except KeyboardInterrupt:
+        sys.stderr.write("dsar: interrupted; what was done is saved (continue with --resume)\n")
+        raise SystemExit(130) from None

@@ -1,0 +1,161 @@
+"""`dsar export` and `dsar render`."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from dsar.cli.common import Common, capture_sequence, shown
+from dsar.console import follow
+from dsar.errors import ConfigError
+from dsar.types import Camera, GaussianSequence, RenderOutput
+
+
+@dataclass(frozen=True)
+class Drive(Common):
+    """Flags of commands that drive a trained avatar."""
+
+    run_folder: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(name="run")] = None
+    """Run folder; default: the newest under runs/."""
+    motion: str = "test"
+    """An AMASS/SMPL-X .npz file, a sequence of the run's capture, or its split `test` or `train`."""
+    frames: str | None = None
+    """Frame numbers from 1001 on, e.g. 1001-1100x2; default: all."""
+
+    def open(self) -> tuple[GaussianSequence, list[Camera], str]:
+        """Return the rollout, the capture's cameras and the motion's name."""
+        from dsar.avatar import roll_out
+        from dsar.data.capture import open_capture
+        from dsar.data.motion import read_motion, resample
+        from dsar.training.checkpoint import Run, load_checkpoint, newest_run
+        from dsar_exporters import parse_frames
+
+        self.check_device()
+        run = Run(self.run_folder) if self.run_folder else newest_run()
+        frames = None if self.frames is None else parse_frames(self.frames)
+        avatar, config, provenance = load_checkpoint(run)
+        capture = open_capture(config.capture)
+        name = capture_sequence(capture, self.motion)
+        if name is not None:
+            motion = capture.motions[name]
+        else:
+            motion = read_motion(Path(self.motion), avatar.body)
+        if motion.fps != avatar.fps:
+            motion = resample(motion, avatar.fps)
+        sequence = roll_out(avatar, motion, frames=frames, provenance=provenance)
+        return sequence, list(capture.cameras), motion.name
+
+
+@dataclass(frozen=True)
+class Export(Drive):
+    """Drive an avatar with a motion and write the Gaussians of each frame."""
+
+    usd: Path | None = None
+    """USD asset: .usda or .usdc."""
+    ply: Path | None = None
+    """Folder of 3DGS splat files, one per frame."""
+    name: str = "avatar"
+    """Name of the asset and of the files."""
+
+    def run(self) -> None:
+        """Write every requested format."""
+        from dsar_exporters import write_ply, write_usd
+
+        if self.usd is None and self.ply is None:
+            raise ConfigError("dsar export: nothing to write; give --usd out.usda, --ply DIR or both")
+        sequence, cameras, motion = self.open()
+        written: dict[str, str] = {}
+        if self.usd is not None:
+            write_usd(shown(sequence, self.progress, "usd"), self.usd, name=self.name, cameras=cameras)
+            written["usd"] = str(self.usd)
+        if self.ply is not None:
+            write_ply(shown(sequence, self.progress, "ply"), self.ply, name=self.name)
+            written["ply"] = str(self.ply)
+        facts = {"gaussians": sequence.num_gaussians, "frames": len(sequence), "fps": sequence.fps}
+        self.write_json({"motion": motion, "written": written, **facts})
+
+
+@dataclass(frozen=True)
+class Render(Drive):
+    """Drive an avatar with a motion and render image sequences."""
+
+    exr: Path | None = None
+    """Folder of EXR sequences: DIR/<camera>/<name>.<camera>.%04d.exr."""
+    png: Path | None = None
+    """Folder of PNG sequences with alpha."""
+    mp4: Path | None = None
+    """Video of the chosen cameras side by side, over white."""
+    camera: str = "all"
+    """A camera of the capture, or `all`."""
+    res: tuple[int, int] | None = None
+    """Width and height in pixels; default: the capture's."""
+    colorspace: str = "lin_rec709_scene"
+    """Scene-linear colour space of the EXRs (an OCIO name or interop id)."""
+    name: str = "avatar"
+    """Name in the files."""
+
+    def run(self) -> None:
+        """Render every chosen camera and write every requested format."""
+        if self.exr is None and self.png is None and self.mp4 is None:
+            raise ConfigError("dsar render: nothing to write; give --exr DIR, --png DIR or --mp4 FILE")
+        sequence, cameras, motion = self.open()
+        cameras = self.choose(cameras)
+        images = 0
+        for frame, camera, output in self.images(sequence, cameras):
+            self.write(frame, camera, output, sequence)
+            images += 1
+        if self.mp4 is not None:
+            self.write_video(sequence, cameras)
+        self.write_json({"motion": motion, "images": images, "cameras": [c.name for c in cameras]})
+
+    def choose(self, cameras: Sequence[Camera]) -> list[Camera]:
+        """Return the cameras to render, at the requested resolution."""
+        names = [camera.name for camera in cameras]
+        if self.camera != "all" and self.camera not in names:
+            raise ConfigError(f"--camera {self.camera}: expected all or one of {', '.join(names)}")
+        chosen = [camera for camera in cameras if self.camera in ("all", camera.name)]
+        return [camera.resized(*self.res) if self.res else camera for camera in chosen]
+
+    def images(
+        self, sequence: GaussianSequence, cameras: list[Camera]
+    ) -> Iterator[tuple[int, Camera, RenderOutput]]:
+        """Yield the images for EXR and PNG, if any of them is wanted."""
+        from dsar_render import render_sequence
+
+        if self.exr is None and self.png is None:
+            return iter(())
+        made = render_sequence(sequence, cameras)
+        return follow(made, len(sequence) * len(cameras), self.progress, "render")
+
+    def write(self, frame: int, camera: Camera, output: RenderOutput, sequence: GaussianSequence) -> None:
+        """Write one image in the requested formats."""
+        from dsar_exporters import exr_path, write_exr
+        from dsar_render import write_png
+
+        if self.exr is not None:
+            path = exr_path(self.exr, name=self.name, camera=camera.name, frame=frame)
+            facts = {"fps": sequence.fps, "provenance": sequence.provenance, "colorspace": self.colorspace}
+            write_exr(output, path, camera=camera, frame=frame, **facts)
+        if self.png is not None:
+            write_png(output, self.png / camera.name / f"{self.name}.{camera.name}.{frame:04d}.png")
+
+    def write_video(self, sequence: GaussianSequence, cameras: list[Camera]) -> None:
+        """Write the video of all chosen cameras side by side."""
+        import numpy as np
+        import torch
+
+        from dsar_render import display_image, render_sequence, write_mp4
+
+        assert self.mp4 is not None
+
+        def rows() -> Iterator[np.ndarray]:
+            row = []
+            for _, _, output in render_sequence(sequence, cameras, background=torch.ones(3)):
+                row.append(display_image(output))
+                if len(row) == len(cameras):
+                    yield np.concatenate(row, 1)
+                    row = []
+
+        write_mp4(follow(rows(), len(sequence), self.progress, "video"), self.mp4, fps=sequence.fps)

@@ -1,0 +1,103 @@
+"""`dsar eval` and `dsar stress`."""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from dsar.cli.common import Common, capture_sequence
+from dsar.cli.previews import write_findings, write_worst
+from dsar.console import Bar, follow
+
+
+@dataclass(frozen=True)
+class Eval(Common):
+    """Measure a run on the frames it never saw; or train and measure the models of the paper's tables."""
+
+    run_folder: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(name="run")] = None
+    """Run folder; default: the newest under runs/."""
+    ablations: bool = False
+    """The paper's ablations instead of a run: trained, measured, and set beside the paper's figures."""
+    baselines: bool = False
+    """The paradigms of other systems, likewise."""
+    capture: str = "embedded"
+    """What tables are made on: a capture folder, or `embedded`."""
+    minutes: float = 10.0
+    """Training of each of a table's models."""
+    hours: float | None = None
+    """Stop before this time is over; the same command goes on with what is missing."""
+    study: Path = Path("runs/study")
+    """Folder of the tables' models; what it holds is not done again."""
+
+    def run(self) -> None:
+        """Measure and print the figures."""
+        if self.ablations or self.baselines:
+            self.run_study()
+        else:
+            self.run_heldout()
+
+    def run_study(self) -> None:
+        """Train and measure what the tables lack; print them."""
+        from dsar.evaluation.study import ABLATIONS, BASELINES, Study, summarize_tables, to_markdown
+
+        self.check_device()
+        tables = (ABLATIONS if self.ablations else {}) | (BASELINES if self.baselines else {})
+        study = Study(self.study, self.minutes, self.capture)
+        with Bar(self.progress, "study").running() as bar:
+            complete = study.run(list(tables.values()), self.hours, lambda what, share: bar.show(share, what))
+        summary = summarize_tables(study, tables)
+        self.write_json({"complete": complete, "minutes": self.minutes, "tables": summary})
+        sys.stdout.write(to_markdown(summary))
+
+    def run_heldout(self) -> None:
+        """Measure one run."""
+        from dsar.data.capture import open_capture
+        from dsar.evaluation.heldout import evaluate
+        from dsar.training.checkpoint import Run, load_checkpoint, newest_run
+
+        self.check_device()
+        run = Run(self.run_folder) if self.run_folder else newest_run()
+        avatar, config, _ = load_checkpoint(run)
+        figures = evaluate(avatar, open_capture(config.capture))
+        self.write_json(figures)
+        write_worst(run.folder, figures["worst"])
+        write_findings(run.folder, "figures.json", figures)
+        for split, values in figures["splits"].items():
+            if values is not None:
+                keys = ("psnr", "psnr_box", "psnr_box_template", "ssim")
+                sys.stdout.write(
+                    f"{split:6s} " + "  ".join(f"{key} {values[key]:.3f}" for key in keys) + "\n"
+                )
+        sys.stdout.write(f"one-to-many {figures['one_to_many']}\n")
+
+
+@dataclass(frozen=True)
+class Stress(Common):
+    """Drive an avatar where rollouts fail."""
+
+    run_folder: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(name="run")] = None
+    """Run folder; default: the newest under runs/."""
+
+    def run(self) -> None:
+        """Run the battery on the held-out motion that is furthest from training; print each verdict."""
+        from dsar.data.capture import open_capture
+        from dsar.evaluation.stress import CASES, stress
+        from dsar.training.checkpoint import Run, load_checkpoint, newest_run
+
+        self.check_device()
+        run = Run(self.run_folder) if self.run_folder else newest_run()
+        avatar, config, _ = load_checkpoint(run)
+        capture = open_capture(config.capture)
+        verdicts = stress(avatar, capture.motions[capture_sequence(capture, "test") or ""], CASES)
+        found = {}
+        for name, verdict in follow(verdicts, len(CASES), self.progress, "stress"):
+            found[name] = verdict.to_json()
+            outcome = "passed" if verdict.passed else "FAILED"
+            sys.stdout.write(f"{name:9s} {outcome}  {verdict.describe()}\n")
+        survived = sum(case["pass"] for case in found.values())
+        sys.stdout.write(f"{survived} of {len(found)} passed\n")
+        battery = {"cases": found, "survived": survived, "tried": len(found)}
+        self.write_json(battery)
+        write_findings(run.folder, "stress.json", battery)

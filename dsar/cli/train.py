@@ -1,0 +1,94 @@
+"""`dsar train`."""
+
+import dataclasses
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from dsar.cli.common import Common
+from dsar.cli.previews import write_previews
+from dsar.config import PRESETS, AtlasConfig, LossConfig, ModelConfig, ScheduleConfig, TrainConfig
+from dsar.console import Bar
+
+
+@dataclass(frozen=True)
+class Train(Common):
+    """Learn an avatar from a capture."""
+
+    capture: tyro.conf.Positional[str] = "embedded"
+    """A capture folder in any supported format, or `embedded`."""
+    preset: Literal["demo", "small", "paper"] = "demo"
+    """Settings to start from; every other flag overrides them."""
+    out: Path | None = None
+    """Run folder; default runs/<preset>."""
+    body: Path | None = None
+    """SMPL-X model file (.npz, .pkl); default: the capture's own, else the embedded body."""
+    train_frames: str | None = None
+    """Frames of each training sequence, e.g. 0-239."""
+    test_frames: str | None = None
+    """Frames of each test sequence, e.g. 250-359."""
+    cameras: int | None = None
+    """Cameras to learn from, spread as far as can be; default: all."""
+    steps: int | None = None
+    """Updates in all."""
+    minutes: float | None = None
+    """Wall-clock budget; the schedule is compressed to fit."""
+    workers: int | None = None
+    """Processes, one core each."""
+    resume: bool = False
+    """Go on with the run in --out."""
+    atlas: AtlasConfig = field(default_factory=AtlasConfig)
+    """The texel grid."""
+    model: ModelConfig = field(default_factory=ModelConfig)
+    """The network."""
+    loss: LossConfig = field(default_factory=LossConfig)
+    """Weights of the losses."""
+    schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
+    """Stages and optimiser."""
+
+    def config(self) -> TrainConfig:
+        """Return the settings of the run."""
+        preset = PRESETS[self.preset]
+        schedule = dataclasses.replace(
+            self.schedule,
+            steps=self.schedule.steps if self.steps is None else self.steps,
+            minutes=self.schedule.minutes if self.minutes is None else self.minutes,
+        )
+        return dataclasses.replace(
+            preset,
+            capture=self.capture,
+            body=None if self.body is None else str(self.body),
+            train_frames=self.train_frames,
+            test_frames=self.test_frames,
+            cameras=self.cameras,
+            seed=self.seed,
+            workers=preset.workers if self.workers is None else self.workers,
+            atlas=self.atlas,
+            model=self.model,
+            loss=self.loss,
+            schedule=schedule,
+        )
+
+    def run(self) -> None:
+        """Train, then leave pictures and a report."""
+        from dsar.training.checkpoint import Run, read_progress
+        from dsar.training.loop import train
+        from dsar.training.report import Report
+
+        self.check_device()
+        run = Run(self.out or Path("runs") / self.preset)
+        last: list[Report] = []
+        with Bar(self.progress, "train").running() as bar:
+
+            def report(line: Report) -> None:
+                last[:] = [line]
+                left = line.seconds * (1 / max(line.progress, 1e-3) - 1)
+                numbers = f"loss {line.loss:.4f} PSNR {line.psnr:.2f} dB"
+                bar.show(line.progress, f"{line.stage} step {line.step} {numbers} {left:.0f} s left")
+
+            train(self.config(), run, resume=self.resume, report=report)
+        sheet = write_previews(run.folder)
+        reached = dataclasses.asdict(last[-1]) if last else read_progress(run)
+        self.write_json({"run": str(run.folder), "sheet": str(sheet), **reached})

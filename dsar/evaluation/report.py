@@ -1,0 +1,151 @@
+"""report.html: one self-contained page that says what a run is, how it was made and how good it is."""
+
+import base64
+import dataclasses
+import json
+import mimetypes
+import os
+import platform
+from collections.abc import Iterator, Mapping
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import plotly.graph_objects as go
+from jinja2 import Environment, StrictUndefined
+from plotly.offline import get_plotlyjs
+
+from dsar.config import PRESETS, TrainConfig, config_from_json, config_to_json
+from dsar.training.checkpoint import Run, read_progress
+
+_STAGES = {"template": "#9aa5b1", "imitation": "#c77d0a", "pose": "#4c78a8", "autoregressive": "#2a7f62"}
+_METRICS = ("psnr", "psnr_box", "psnr_box_template", "ssim", "lpips", "flip", "tpsnr", "warp_error")
+_PREVIEWS = (
+    ("compare.mp4", "Side by side", "Truth and avatar, on a motion that training never saw."),
+    ("sheet.png", "Frames it never saw", "Truth above, the avatar below."),
+    ("worst.png", "Where it is worst", "The held-out views with the lowest PSNR in the mask's box."),
+)
+
+
+def write_report(run: Run) -> Path:
+    """Write report.html from what lies in a run's folder; what was not measured yet is said to be so.
+
+    That is config.json, metrics.jsonl, the checkpoint, previews, and the figures that `dsar eval` and
+    `dsar stress` leave (figures.json, stress.json).
+    """
+    config, lines = config_from_json(run.config), _lines(run)
+    figures, battery = (_read(run.folder / name) for name in ("figures.json", "stress.json"))
+    splits = {name: values for name, values in (figures or {}).get("splits", {}).items() if values}
+    metrics = [key for key in _METRICS if any(values.get(key) is not None for values in splits.values())]
+    facts = {
+        "name": run.folder.name,
+        "folder": str(run.folder),
+        "plotly": get_plotlyjs(),
+        "config": config,
+        "settings": config_to_json(config),
+        "changed": [(key, *values) for key, values in sorted(changed_settings(config).items())],
+        "progress": read_progress(run),
+        "lines": lines,
+        "previews": list(_previews(run)),
+        "figures": figures,
+        "metrics": metrics,
+        "splits": [(name, *(values.get(key) for key in metrics)) for name, values in splits.items()],
+        "battery": battery,
+        "stability": _draw_stability(battery) if battery else "",
+        "curves": list(_draw_curves(lines)),
+        "environment": _environment(),
+        "rows": lambda garment: [(who, *values.values()) for who, values in garment.items()],
+    }
+    engine = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
+    engine.filters["figure"] = _figure
+    source = Path(__file__).with_name("report.html.jinja").read_text()
+    path = run.folder / "report.html"
+    draft = path.with_suffix(".tmp")
+    draft.write_text(engine.from_string(source).render(facts))
+    os.replace(draft, path)
+    return path
+
+
+def changed_settings(config: TrainConfig) -> dict[str, tuple[Any, Any]]:
+    """Return the settings in which a run differs from its preset: the preset's value and the run's."""
+    base, own = (_flat(dataclasses.asdict(each)) for each in (PRESETS[config.preset], config))
+    return {key: (base[key], own[key]) for key in own if base[key] != own[key]}
+
+
+def _previews(run: Run) -> Iterator[dict[str, Any]]:
+    for name, title, note in _PREVIEWS:
+        path = run.folder / "previews" / name
+        if path.exists():
+            kind = mimetypes.guess_type(name)[0] or ""
+            data = f"data:{kind};base64,{base64.b64encode(path.read_bytes()).decode()}"
+            yield {"title": title, "note": note, "data": data, "video": kind.startswith("video")}
+
+
+def _draw_stability(battery: Mapping[str, Any]) -> str:
+    """Return the curves of the cases; one at a time is shown, for their units differ."""
+    figure = go.Figure()
+    for case, verdict in battery["cases"].items():
+        shown = True if case == "stop" else "legendonly"
+        figure.add_scatter(y=verdict["curve"], name=f"{case}, {verdict['unit']}", visible=shown)
+    return _draw(figure, "round, cycle or frame", "the case's own measure", log=True)
+
+
+def _draw_curves(lines: list[dict[str, Any]]) -> Iterator[str]:
+    for key, label in (("psnr", "PSNR of training crops, dB"), ("loss", "loss")):
+        figure = go.Figure()
+        for stage, colour in _STAGES.items():
+            part = [line for line in lines if line["stage"] == stage]
+            # Imitation sees no images.
+            if part and (key, stage) != ("psnr", "imitation"):
+                steps, values = [line["step"] for line in part], [line[key] for line in part]
+                figure.add_scatter(x=steps, y=values, name=stage, line_color=colour)
+        yield _draw(figure, "update", label, log=key == "loss")
+    probed = [line for line in lines if line["gradients"]]
+    if probed:
+        figure = go.Figure()
+        for name in sorted({name for line in probed for name in line["gradients"]}):
+            shares = [line["gradients"].get(name) for line in probed]
+            figure.add_scatter(x=[line["step"] for line in probed], y=shares, name=name)
+        yield _draw(figure, "update", "gradient over the images'", log=True)
+
+
+def _draw(figure: go.Figure, x: str, y: str, *, log: bool) -> str:
+    figure.update_layout(
+        template="plotly_white",
+        height=340,
+        margin={"l": 60, "r": 20, "t": 20, "b": 50},
+        xaxis_title=x,
+        yaxis_title=y,
+        yaxis_type="log" if log else "linear",
+    )
+    return figure.to_html(full_html=False, include_plotlyjs=False)
+
+
+def _environment() -> list[tuple[str, str]]:
+    packages = [(name, metadata.version(name)) for name in ("dsar-avatar", "torch", "numba", "numpy")]
+    machine = [("machine", platform.platform()), ("processors", str(os.cpu_count()))]
+    return [("Python", platform.python_version()), *packages, *machine]
+
+
+def _lines(run: Run) -> list[dict[str, Any]]:
+    if not run.metrics.exists():
+        return []
+    return [json.loads(line) for line in run.metrics.read_text().splitlines()]
+
+
+def _read(path: Path) -> dict[str, Any] | None:
+    return json.loads(path.read_text()) if path.exists() else None
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for key, value in values.items():
+        found |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
+    return found
+
+
+def _figure(value: Any) -> str:
+    """Return a cell's text: numbers to four digits, a dash where there is none."""
+    if value is None:
+        return "-"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
