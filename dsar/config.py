@@ -69,6 +69,8 @@ class ModelConfig:
     pixel_shuffle: int = 1
     """Pixels of its maps per cell of the network's finest level, each way (1: the paper's): with 2, a quarter
     of the work."""
+    bases: int = 0
+    """Fixed maps that the output is a mixture of, instead of the decoder's convolutions; 0: the decoder."""
     identity_channels: int = 8
     """Channels of a learnt static map that tells pixels apart (extension)."""
     recall: float = 0.5
@@ -224,10 +226,10 @@ class TrainConfig:
             raise ConfigError(
                 f"model.channels ends in {model.channels[-1]}, not a multiple of {model.heads} heads"
             )
-        if model.window < 1 or model.memory < 0 or model.feedback < 0:
+        if model.window < 1 or min(model.memory, model.feedback, model.bases) < 0:
             raise ConfigError(
-                f"model.window is {model.window} (>= 1), model.memory {model.memory} and model.feedback "
-                f"{model.feedback} (>= 0)"
+                f"model.window is {model.window} (>= 1), model.memory {model.memory}, model.feedback "
+                f"{model.feedback} and model.bases {model.bases} (>= 0)"
             )
         if not model.causal and model.readout == "last":
             raise ConfigError(

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 
 from dsar.config import ModelConfig
-from dsar.network.decoder import Decoder
+from dsar.network.decoder import Decoder, LinearBases
 from dsar.network.encoder import WIRINGS, Window
 from dsar.network.state import NetworkState, push, repeat_where
 from dsar.network.temporal import MemoryBank, MotionEmbedding, TemporalAttention, TemporalMixing
@@ -88,7 +88,12 @@ class DualStreamNetwork(nn.Module):
         self.attention = TemporalAttention(deepest, config.heads, config.window)
         self.bank = MemoryBank(deepest, config.heads, config.memory, config.recall) if config.memory else None
         self.mixing = nn.ModuleList(TemporalMixing(c, config.window) for c in channels[:-1])
-        self.decoder = Decoder(channels, fine**2 * (3 + config.appearance_channels))
+        outputs, coarse = fine**2 * (3 + config.appearance_channels), self.level_size(len(channels) - 1)
+        self.decoder = (
+            LinearBases(deepest * coarse[0] * coarse[1], outputs, self.grid, config.bases)
+            if config.bases
+            else Decoder(channels, outputs)
+        )
 
     def hidden_weights(self) -> list[nn.Parameter]:
         """Return the convolutions' weights between the inputs and the head."""

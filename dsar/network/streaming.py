@@ -193,7 +193,7 @@ def _laid_out(network: DualStreamNetwork, precision: torch.dtype | None) -> Dual
     if network.occupied.device.type == "cpu" and network.grid[0] * network.grid[1] <= _SMALL:
         ups = [up for up in network.decoder.ups if isinstance(up, Upsample)]
         network.decoder.ups = nn.ModuleList(map(ShuffledUpsample, ups))
-        if network.config.pixel_shuffle == 1:
+        if network.config.pixel_shuffle == 1 and isinstance(network.decoder.head, nn.Conv2d):
             _pad_outputs(network.decoder.head)
     if precision is not None:
         network = network.to(precision)

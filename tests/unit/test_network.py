@@ -182,6 +182,7 @@ ABLATIONS = {
     "without motion embedding": ({"motion_embedding": False}, {"motion_embedding."}),
     "mean of rows": ({"readout": "mean"}, set()),
     "bidirectional": ({"readout": "mean", "causal": False}, set()),
+    "linear bases": ({"bases": 4}, {"decoder."}),
     "longer": ({"window": 6, "memory": 5}, {"attention.age", "bank.attention.age", "mixing.0.weights"}),
 }
 
@@ -226,6 +227,19 @@ def test_an_ablation_changes_its_part_and_the_output(name):
         gone[kept] = 0
         blind, _ = roll(full, maps * (1 - gone), speed)
         assert torch.allclose(blind[-1].offset, two[-1].offset, atol=1e-6)
+
+
+@pytest.mark.parametrize("changes", [{"bases": 4}, {"channels": (8,)}], ids=["bases", "one level"])
+def test_rollouts_of_the_smallest_networks_are_those_of_training(changes):
+    config = dataclasses.replace(SMALL, **changes)
+    network, (maps, speed) = build(config).double(), (x.double() for x in inputs(config, 8))
+    expected, _ = roll(network, maps, speed)
+    rollout = Rollout(network)
+    for frame, output in enumerate(expected):
+        made = rollout.step(maps[frame], speed[frame])
+        assert torch.allclose(made.offset, output.offset, atol=1e-12)
+        assert torch.allclose(made.appearance, output.appearance, atol=1e-12)
+    assert expected[-1].offset.abs().max() > 1e-3
 
 
 def test_rows_that_see_the_future_differ_from_causal_ones():

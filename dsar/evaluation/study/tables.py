@@ -164,6 +164,11 @@ BASELINES: dict[str, Table] = {
             Row("pose only, one frame (the paradigm of Animatable-GS)", _POSE_ONLY, seeds=3),
             Row("window of poses, no streams", _WINDOW_ONLY),
             Row("long history of poses, no streams", {**_WINDOW_ONLY, "model.window": 20}),
+            Row("pose, linear bases (the paradigm of MMLPs)", {**_POSE_ONLY, "model.bases": 30}),
+            Row(
+                "pose features at each Gaussian (the paradigm of GaussianAvatar)",
+                {**_POSE_ONLY, "model.channels": (64,), "model.identity_channels": 32},
+            ),
         ),
     ),
 }
