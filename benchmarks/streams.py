@@ -19,9 +19,10 @@ from dsar.avatar.avatar import Avatar
 from dsar.avatar.rollout import START_FRAME, network_outputs, roll_out
 from dsar.data.capture import open_capture
 from dsar.data.native import NativeCapture
-from dsar.evaluation.heldout import compare, evaluate_sequence, one_to_many, render_white, true_view
+from dsar.evaluation.heldout import compare, evaluate_sequence, one_to_many
 from dsar.evaluation.horizon import looped
 from dsar.evaluation.settling import rms_speeds, settle_time
+from dsar.evaluation.views import render_white, true_view
 from dsar.training.checkpoint import Run, load_checkpoint
 
 VARIANTS = {"both": ("geometric", "state"), "state": ("state",), "geometric": ("geometric",), "none": ()}

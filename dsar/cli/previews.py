@@ -116,14 +116,11 @@ class _Scene:
         count = len(self.capture.cameras)
         return sorted({0, count // 3, 2 * count // 3})
 
-    def truth(self, sequence: str, frame: int, camera: int):
+    def truth(self, sequence: str, frame: int, camera: int) -> Any:
         """Return a true image."""
-        import numpy as np
+        from dsar.evaluation.views import to_bytes, true_view
 
-        from dsar.evaluation.heldout import true_view
-
-        color = true_view(self.capture, sequence, frame, camera).color
-        return (color.numpy() * 255).round().astype(np.uint8)
+        return to_bytes(true_view(self.capture, sequence, frame, camera).color)
 
     def images(
         self, sequence: str, frames: Sequence[int], cameras: Sequence[int]

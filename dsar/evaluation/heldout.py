@@ -7,13 +7,11 @@ white; `box` is the bounding box of the true mask. Figures are means over views.
 import statistics
 from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from types import MappingProxyType
 from typing import Any
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from dsar.avatar.avatar import Avatar
@@ -23,6 +21,8 @@ from dsar.evaluation.garment import measure_garment
 from dsar.evaluation.metrics import ImageMetric, correlation, load_perceptual, psnr
 from dsar.evaluation.parts import read_clock, time_parts
 from dsar.evaluation.temporal import temporal_psnr, trace_back, warp_error
+from dsar.evaluation.video import evaluate_video, vmaf_missing
+from dsar.evaluation.views import WHITE, View, render_white, true_view
 from dsar.network import STREAMS, Stream
 from dsar.network.streaming import Rollout
 from dsar.raster import rasterize
@@ -30,36 +30,13 @@ from dsar.training.losses import ssim
 from dsar.training.targets import mask_box
 from dsar.types import Camera, Capture, Gaussians
 
-WHITE = torch.ones(3)
 _IMAGE_METRICS = ("psnr", "psnr_box", "psnr_box_template", "psnr_garment", "ssim", "lpips", "flip")
-METRICS = (*_IMAGE_METRICS, "tpsnr", "warp_error", "mmd")
+METRICS = (*_IMAGE_METRICS, "tpsnr", "tlpips", "warp_error", "vmaf", "mmd")
 """What a split has a figure of, or null."""
 _SELDOM = 4
 _WARM_UP = 10
 _MOMENT = 15
 """Frames that look alike."""
-
-
-@dataclass(frozen=True)
-class View:
-    """One image of the truth over white."""
-
-    color: Float[Tensor, "h w 3"]
-    """sRGB over white."""
-    mask: Float[Tensor, "h w"]
-    """Alpha of the truth."""
-
-
-def true_view(capture: Capture, sequence: str, frame: int, camera: int) -> View:
-    """Return a true image over white."""
-    pixels = torch.tensor(capture.image(sequence, frame, camera)).float() / 255
-    alpha = pixels[..., 3]
-    return View(pixels[..., :3] * alpha[..., None] + (1 - alpha[..., None]), alpha)
-
-
-def render_white(gaussians: Gaussians, camera: Camera) -> Float[Tensor, "h w 3"]:
-    """Return an image over white."""
-    return rasterize(gaussians, camera, background=WHITE).color
 
 
 @torch.no_grad()
@@ -90,7 +67,7 @@ def evaluate_sequence(
                 row |= compare(image, render_white(template, camera), truth)
                 if frame % (_SELDOM * stride) == 0 and before is not None:
                     last = true_view(capture, sequence, frame - 1, index)
-                    row |= compare_change((before, gaussians), camera, (last, truth))
+                    row |= compare_change((before, gaussians), camera, (last, truth), perceptual)
                     row |= {name: metric(image, truth.color) for name, metric in perceptual.items()}
                 rows.append(row)
         before = gaussians
@@ -110,11 +87,21 @@ def compare(image: Tensor, template: Tensor, truth: View) -> dict[str, float]:
 
 
 def compare_change(
-    gaussians: tuple[Gaussians, Gaussians], camera: Camera, truths: tuple[View, View]
+    gaussians: tuple[Gaussians, Gaussians],
+    camera: Camera,
+    truths: tuple[View, View],
+    perceptual: Mapping[str, ImageMetric],
 ) -> dict[str, float]:
-    """Return the metrics of one view of two frames that follow each other."""
+    """Return the metrics of one view of two frames that follow each other.
+
+    `tlpips` says how much more, or less, a frame differs from the one before than it does in truth (Chu et
+    al. 2020).
+    """
     before, now = (rasterize(each, camera, background=WHITE, outputs=("contributors",)) for each in gaussians)
     found = {"tpsnr": temporal_psnr((before.color, now.color), (truths[0].color, truths[1].color))}
+    if "lpips" in perceptual:
+        lpips = perceptual["lpips"]
+        found["tlpips"] = abs(lpips(before.color, now.color) - lpips(truths[0].color, truths[1].color))
     error = warp_error(before, now, *trace_back(now, gaussians[1], gaussians[0], camera))
     return found if error is None else found | {"warp_error": error}
 
@@ -199,9 +186,21 @@ def evaluate(
         name: evaluate_sequence(avatar, capture, name, each, streams=streams, perceptual=perceptual)
         for name, each in strides.items()
     }
+    if "lpips" in skipped:
+        skipped["tlpips"] = skipped["lpips"]
+    films, reason = {}, vmaf_missing()
+    if reason:
+        skipped["vmaf"] = reason
+    else:
+        films = {
+            name: evaluate_video(avatar, capture, name, streams=streams) for name in capture.splits["test"]
+        }
     for split in ("train", "test", "nd", "fd"):
         names = [name for name in capture.splits.get(split, ()) if name in by_sequence]
         splits[split] = summarize(by_sequence, names, len(capture.cameras)) if names else None
+        judged = [films[name] for name in names if name in films]
+        if judged:
+            splits[split]["vmaf"] = statistics.fmean(judged)
     garments = {name: measure_garment(avatar, capture, name, 2 * stride) for name in capture.splits["test"]}
     if not all(garments.values()):
         skipped["garment"] = "no simulated garment in the capture, or no garment chart in the avatar"

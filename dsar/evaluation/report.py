@@ -19,7 +19,7 @@ from dsar.config import PRESETS, TrainConfig, config_from_json, config_to_json
 from dsar.training.checkpoint import Run, read_progress
 
 _STAGES = {"template": "#9aa5b1", "imitation": "#c77d0a", "pose": "#4c78a8", "autoregressive": "#2a7f62"}
-_METRICS = ("psnr", "psnr_box", "psnr_box_template", "ssim", "lpips", "flip", "tpsnr", "warp_error")
+_METRICS = ("psnr", "psnr_box", "psnr_box_template", "ssim", "lpips", "flip", "tpsnr", "warp_error", "vmaf")
 _PREVIEWS = (
     ("compare.mp4", "Side by side", "Truth and avatar, on a motion that training never saw."),
     ("sheet.png", "Frames it never saw", "Truth above, the avatar below."),

@@ -7,7 +7,7 @@ from typing import Any
 from dsar.evaluation.study.runner import Study
 from dsar.evaluation.study.tables import Row, Table
 
-_IMAGE = ("psnr", "psnr_box", "ssim", "lpips", "flip", "tpsnr")
+_IMAGE = ("psnr", "psnr_box", "ssim", "lpips", "flip", "tpsnr", "vmaf")
 _COLUMNS = (*_IMAGE, "correlation", "fps", "passed", "updates")
 _DIGITS = {"ssim": 4, "lpips": 4, "flip": 4, "fps": 0, "passed": 0, "updates": 0}
 
