@@ -1,12 +1,15 @@
 """Change between frames: what a known motion must give."""
 
 import dataclasses
+from functools import partial
 
 import pytest
 import torch
 
+from dsar.evaluation.heldout import compare_change
 from dsar.evaluation.metrics import flip
 from dsar.evaluation.temporal import temporal_psnr, trace_back, warp_error
+from dsar.evaluation.views import View
 from dsar.geometry.cameras import project
 from dsar.raster import rasterize
 from dsar.types import Camera, Gaussians
@@ -124,3 +127,16 @@ def test_flip_is_zero_for_equal_images_one_for_black_against_white_and_sees_diff
     assert 0.9 < flip(black, white) <= 1
     small, large = flip((image + 0.02).clamp(0, 1), image), flip((image + 0.2).clamp(0, 1), image)
     assert 0 < small < large < 1
+
+
+def test_tlpips_is_how_much_more_a_film_changes_than_it_should():
+    def distance(image, truth):
+        return float((image - truth).abs().mean())
+
+    before, now = wall(), moved(wall(), 0.05)
+    views = [View(draw(each).color, draw(each).alpha) for each in (before, now)]
+    judge = partial(compare_change, (before, now), CAMERA, perceptual={"lpips": distance})
+    assert judge((views[0], views[1]))["tlpips"] == pytest.approx(0, abs=1e-6)
+    frozen = judge((views[0], views[0]))["tlpips"]
+    assert frozen == pytest.approx(distance(views[0].color, views[1].color), rel=1e-4)
+    assert frozen > 1e-3

@@ -34,6 +34,6 @@ def test_films_that_cannot_be_compared_are_refused(film):
     with pytest.raises(ValueError, match="cannot be compared"):
         vmaf(film[:3], film)
     with pytest.raises(ValueError, match="one size"):
-        vmaf([film[0], film[0][:100]], film[:2])
+        vmaf(iter([film[0], film[0][:100]]), film[:2])
     with pytest.raises(ValueError, match="none"):
         vmaf([], film)
