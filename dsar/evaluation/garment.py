@@ -1,14 +1,13 @@
 """The garment's shape against the simulated truth, beside what no history and another past would give."""
 
 import statistics
-from collections.abc import Iterable
 
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
 from dsar.avatar.avatar import Avatar
-from dsar.avatar.rollout import START_FRAME, roll_out, template_sequence
+from dsar.avatar.rollout import roll_out, template_sequence
 from dsar.data.native import NativeCapture
 
 CLOSE = 0.02
@@ -85,6 +84,12 @@ def measure_hem(points: Float[Tensor, "h 3"]) -> tuple[float, float]:
     return float((flat - flat.mean(0)).norm(dim=-1).mean()), float(points[:, _UP].mean())
 
 
+def measure_jitter(points: Float[Tensor, "f p 3"], fps: float) -> float:
+    """Return the mean jerk of moving points, m/s³; 0 of fewer than four frames."""
+    jerks = points.diff(n=3, dim=0).norm(dim=-1) * fps**3
+    return float(jerks.mean()) if len(jerks) else 0.0
+
+
 @torch.no_grad()
 def measure_garment(
     avatar: Avatar, capture: NativeCapture, sequence: str, stride: int
@@ -93,7 +98,8 @@ def measure_garment(
 
     Beside the prediction: `template` is the garment at rest under skinning alone, what a model without any
     history gives; `second` is another simulation of the same motion, begun from a slightly different state:
-    what cannot be predicted. `hem_radius` and `hem_height` are root mean square errors over frames.
+    what cannot be predicted. `hem_radius` and `hem_height` are root mean square errors over frames, `jitter`
+    is the mean jerk of the points in m/s³ over all frames; that of the `truth` is what it should be.
     """
     runs, garment = capture.garment_runs(sequence), avatar.garment_texels()
     if not runs or not len(garment):
@@ -101,27 +107,36 @@ def measure_garment(
     truth = torch.from_numpy(capture.garment(sequence))
     faces = torch.from_numpy(capture.garment_faces(sequence))
     rows = avatar.texels[garment] // avatar.atlas_size[1]
-    lowest = garment[rows == rows.max()]
-    hem = hem_loop(truth[0], faces)
-    motion, frames = capture.motions[sequence], range(0, len(truth), stride)
-    rollout = roll_out(avatar, motion, frames=[START_FRAME + frame for frame in frames])
-    shapes: dict[str, Iterable[tuple[Tensor, Tensor]]] = {
-        name: ((g.means[garment], g.means[lowest]) for _, g in each)
-        for name, each in (("predicted", rollout), ("template", template_sequence(rollout, avatar, motion)))
+    lowest, hem = (rows == rows.max()).nonzero().squeeze(1), hem_loop(truth[0], faces)
+    motion = capture.motions[sequence]
+    rollout = roll_out(avatar, motion)
+    films = {"predicted": rollout, "template": template_sequence(rollout, avatar, motion)}
+    clouds = {
+        name: (torch.stack([g.means[garment] for _, g in each]), lowest) for name, each in films.items()
     }
     if runs > 1:
-        other = torch.from_numpy(capture.garment(sequence, run=1))
-        shapes["second"] = ((other[frame], other[frame, hem]) for frame in frames)
-    return {name: _summarize(each, truth[::stride], faces, hem) for name, each in shapes.items()}
+        clouds["second"] = (torch.from_numpy(capture.garment(sequence, run=1)), hem)
+    clouds["truth"] = (truth, hem)
+    return {
+        name: {
+            **_summarize(points[::stride], border, truth[::stride], faces, hem),
+            "jitter": measure_jitter(points, motion.fps),
+        }
+        for name, (points, border) in clouds.items()
+    }
 
 
 def _summarize(
-    shapes: Iterable[tuple[Tensor, Tensor]], truth: Tensor, faces: Tensor, hem: Tensor
+    clouds: Float[Tensor, "f p 3"],
+    border: Int64[Tensor, " b"],
+    truth: Float[Tensor, "f v 3"],
+    faces: Int64[Tensor, "t 3"],
+    hem: Int64[Tensor, " h"],
 ) -> dict[str, float]:
     found, errors = [], []
-    for (points, lowest), vertices in zip(shapes, truth, strict=True):
+    for points, vertices in zip(clouds, truth, strict=True):
         found.append(measure_shape(points, vertices, faces))
-        radius, height = measure_hem(lowest)
+        radius, height = measure_hem(points[border])
         true_radius, true_height = measure_hem(vertices[hem])
         errors.append(((radius - true_radius) ** 2, (height - true_height) ** 2))
     means = {name: statistics.fmean(each[name] for each in found) for name in found[0]}

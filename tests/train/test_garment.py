@@ -9,6 +9,7 @@ from dsar.avatar.avatar import Avatar
 from dsar.avatar.garment import loose_extent
 from dsar.config import AtlasConfig, TrainConfig
 from dsar.data.capture import open_capture
+from dsar.evaluation.garment import measure_garment
 from dsar.raster import rasterize
 from dsar.training.optimizers import make_optimizers, set_rates
 from dsar.training.segment import SegmentTrainer
@@ -39,6 +40,17 @@ def test_the_chart_spans_the_true_skirt_at_rest(capture, avatar):
     assert abs(world[:, 1].max() - truth[:, 1].max()) < 0.12
     nearest = np.linalg.norm(truth[:, None] - world[None], axis=-1).min(1)
     assert np.median(nearest) < 0.03
+
+
+def test_the_garments_figures_stand_between_the_template_s_and_the_truth_s(capture, avatar):
+    found = measure_garment(avatar, capture, "near", 26)
+    # An untrained network predicts its template.
+    assert found["predicted"] == pytest.approx(found["template"])
+    assert found["truth"]["chamfer"] < 1e-4
+    assert found["truth"]["fscore"] == 1
+    assert found["truth"]["hem_radius"] == found["truth"]["hem_height"] == 0
+    assert 0 < found["second"]["chamfer"] < 0.5 * found["template"]["chamfer"]
+    assert found["second"]["jitter"] == pytest.approx(found["truth"]["jitter"], rel=0.2)
 
 
 def test_links_close_the_tube_and_join_neither_charts_nor_islands(avatar):

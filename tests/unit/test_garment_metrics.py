@@ -10,6 +10,7 @@ from dsar.evaluation.garment import (
     distance_to_mesh,
     hem_loop,
     measure_hem,
+    measure_jitter,
     measure_shape,
 )
 
@@ -81,3 +82,12 @@ def test_the_hem_is_the_lowest_border():
     assert height == pytest.approx(0.5, abs=1e-5)
     # Wherever the person goes.
     assert measure_hem(vertices[loop] + torch.tensor([3.0, 0.0, 2.0])) == pytest.approx((0.3, 0.5), abs=1e-5)
+
+
+def test_jitter_is_the_jerk_of_a_path():
+    t = torch.arange(30.0).double() / 24
+    # x = 2 t³ m has a jerk of 12 m/s³, a steady acceleration none.
+    cubic, steady = (torch.stack([x, 0 * x, 0 * x], -1)[:, None] for x in (2 * t**3, 3 * t**2))
+    assert measure_jitter(cubic, 24.0) == pytest.approx(12, rel=1e-6)
+    assert measure_jitter(steady, 24.0) == pytest.approx(0, abs=1e-6)
+    assert measure_jitter(steady[:3], 24.0) == 0
