@@ -17,11 +17,11 @@ from torch import Tensor
 from dsar.avatar.avatar import Avatar
 from dsar.avatar.rollout import START_FRAME, roll_out
 from dsar.data.native import NativeCapture
+from dsar.evaluation.films import FILM_METRICS, evaluate_films
 from dsar.evaluation.garment import measure_garment
 from dsar.evaluation.metrics import ImageMetric, correlation, load_perceptual, psnr
 from dsar.evaluation.parts import read_clock, time_parts
 from dsar.evaluation.temporal import temporal_psnr, trace_back, warp_error
-from dsar.evaluation.video import evaluate_video, vmaf_missing
 from dsar.evaluation.views import WHITE, View, render_white, true_view
 from dsar.network import STREAMS, Stream
 from dsar.network.streaming import Rollout
@@ -31,7 +31,7 @@ from dsar.training.targets import mask_box
 from dsar.types import Camera, Capture, Gaussians
 
 _IMAGE_METRICS = ("psnr", "psnr_box", "psnr_box_template", "psnr_garment", "ssim", "lpips", "flip")
-METRICS = (*_IMAGE_METRICS, "tpsnr", "tlpips", "warp_error", "vmaf", "mmd")
+METRICS = (*_IMAGE_METRICS, "tpsnr", "tlpips", "warp_error", "mmd")
 """What a split has a figure of, or null."""
 _SELDOM = 4
 _WARM_UP = 10
@@ -188,19 +188,14 @@ def evaluate(
     }
     if "lpips" in skipped:
         skipped["tlpips"] = skipped["lpips"]
-    films, reason = {}, vmaf_missing()
-    if reason:
-        skipped["vmaf"] = reason
-    else:
-        films = {
-            name: evaluate_video(avatar, capture, name, streams=streams) for name in capture.splits["test"]
-        }
+    heldout = {split: list(capture.splits.get(split, ())) for split in ("test", "nd", "fd")}
+    heldout = {split: names for split, names in heldout.items() if names}
+    films, missing = evaluate_films(avatar, capture, heldout, streams)
+    skipped |= missing
     for split in ("train", "test", "nd", "fd"):
         names = [name for name in capture.splits.get(split, ()) if name in by_sequence]
-        splits[split] = summarize(by_sequence, names, len(capture.cameras)) if names else None
-        judged = [films[name] for name in names if name in films]
-        if judged:
-            splits[split]["vmaf"] = statistics.fmean(judged)
+        rows = summarize(by_sequence, names, len(capture.cameras)) if names else None
+        splits[split] = rows and rows | dict.fromkeys(FILM_METRICS) | films.get(split, {})
     garments = {name: measure_garment(avatar, capture, name, 2 * stride) for name in capture.splits["test"]}
     if not all(garments.values()):
         skipped["garment"] = "no simulated garment in the capture, or no garment chart in the avatar"

@@ -5,7 +5,7 @@ import pytest
 
 pytest.importorskip("imageio_ffmpeg")
 
-from dsar.evaluation.video import vmaf
+from dsar.evaluation.vmaf import vmaf
 
 
 @pytest.fixture(scope="module")

@@ -5,22 +5,15 @@ Its model was fitted to television pictures, so that figures of other sizes comp
 
 import importlib.util
 import json
-import statistics
 import subprocess
 import tempfile
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
-import torch
 from jaxtyping import UInt8
 
-from dsar.avatar.avatar import Avatar
-from dsar.avatar.rollout import roll_out
 from dsar.errors import MissingDependencyError
-from dsar.evaluation.views import render_white, to_bytes, true_view
-from dsar.network import STREAMS, Stream
-from dsar.types import Capture
 
 _MULTIPLE = 2
 
@@ -62,22 +55,6 @@ def vmaf(images: Iterable[UInt8[np.ndarray, "h w 3"]], truths: Iterable[UInt8[np
         subprocess.run([*command, "-lavfi", compare, "-f", "null", "-"], cwd=folder, check=True)
         found = json.loads((Path(folder) / "found.json").read_text())
     return float(found["pooled_metrics"]["vmaf"]["mean"])
-
-
-@torch.no_grad()
-def evaluate_video(
-    avatar: Avatar, capture: Capture, sequence: str, *, streams: Collection[Stream] = STREAMS
-) -> float:
-    """Return the VMAF of a whole rollout, mean of two cameras that face each other in a ring."""
-    films: dict[int, list[np.ndarray]] = {index: [] for index in {0, len(capture.cameras) // 2}}
-    for _, gaussians in roll_out(avatar, capture.motions[sequence], streams=streams):
-        for index, film in films.items():
-            film.append(to_bytes(render_white(gaussians, capture.cameras[index])))
-    scores = []
-    for index, film in films.items():
-        truth = (to_bytes(true_view(capture, sequence, frame, index).color) for frame in range(len(film)))
-        scores.append(vmaf(film, truth))
-    return statistics.fmean(scores)
 
 
 def _write(frames: Iterable[UInt8[np.ndarray, "h w 3"]], path: Path) -> tuple[int, int, int]:
