@@ -30,6 +30,8 @@ class Eval(Common):
     """Stop before this time is over; the same command goes on with what is missing."""
     study: Path = Path("runs/study")
     """Folder of the tables' models; what it holds is not done again."""
+    chart: Path | None = None
+    """Draw the tables' models, speed against accuracy, to this file (.svg, .png)."""
 
     def run(self) -> None:
         """Measure and print the figures."""
@@ -41,6 +43,7 @@ class Eval(Common):
     def run_study(self) -> None:
         """Train and measure what the tables lack; print them."""
         from dsar.evaluation.study import ABLATIONS, BASELINES, Study, summarize_tables, to_markdown
+        from dsar.evaluation.study.chart import draw_chart, points_of
 
         self.check_device()
         tables = (ABLATIONS if self.ablations else {}) | (BASELINES if self.baselines else {})
@@ -50,6 +53,9 @@ class Eval(Common):
         summary = summarize_tables(study, tables)
         self.write_json({"complete": complete, "minutes": self.minutes, "tables": summary})
         sys.stdout.write(to_markdown(summary))
+        points = points_of(summary)
+        if self.chart is not None and points:
+            draw_chart(points, self.chart)
 
     def run_heldout(self) -> None:
         """Measure one run."""

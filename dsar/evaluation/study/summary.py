@@ -8,8 +8,8 @@ from dsar.evaluation.study.runner import Study
 from dsar.evaluation.study.tables import Row, Table
 
 _IMAGE = ("psnr", "psnr_box", "ssim", "lpips", "flip", "tpsnr", "vmaf")
-_COLUMNS = (*_IMAGE, "correlation", "fps", "passed", "updates")
-_DIGITS = {"ssim": 4, "lpips": 4, "flip": 4, "fps": 0, "passed": 0, "updates": 0}
+_COLUMNS = (*_IMAGE, "correlation", "fps", "gaussians", "passed", "updates")
+_DIGITS = {"ssim": 4, "lpips": 4, "flip": 4, "fps": 0, "gaussians": 0, "updates": 0}
 
 
 def summarize_tables(study: Study, tables: Mapping[str, Table]) -> dict[str, Any]:
@@ -46,7 +46,8 @@ def _numbers(figures: Mapping[str, Any], split: str) -> dict[str, float | None]:
     return {key: images[key] for key in _IMAGE} | {
         "correlation": pairs and pairs["correlation"],
         "fps": figures["fps"],
-        "passed": None if battery is None else sum(case["pass"] for case in battery.values()),
+        "gaussians": figures["gaussians"],
+        "passed": None if battery is None else sum(c["pass"] for c in battery.values()) / len(battery),
         "updates": figures["updates"],
     }
 

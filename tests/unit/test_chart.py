@@ -1,0 +1,41 @@
+"""The chart: who is dominated, and a picture that a browser can read."""
+
+from xml.etree import ElementTree
+
+import pytest
+
+from dsar.evaluation.study.chart import Point, draw_chart, pareto_front, points_of
+
+POINTS = [
+    Point("quick", 2.0, 20.0, 0.06, 1000.0, 1.0),
+    Point("slow and good", 30.0, 22.0, 0.03, 9000.0, 0.5),
+    Point("slow and bad", 20.0, 19.0, None, 9000.0, None),
+    Point("middling", 10.0, 21.0, 0.07, 5000.0, 0.0),
+    Point("as quick, worse", 2.0, 19.5, 0.06, 1000.0, 1.0),
+]
+
+
+def test_the_front_holds_who_is_beaten_by_nobody():
+    assert [p.label for p in pareto_front(POINTS, "psnr_box")] == ["quick", "middling", "slow and good"]
+    assert [p.label for p in pareto_front(POINTS, "lpips")] == ["quick", "slow and good"]
+    for point in (POINTS[2], POINTS[4]):
+        front = pareto_front(POINTS, "psnr_box")
+        assert any(other.ms <= point.ms and other.psnr_box >= point.psnr_box for other in front)
+
+
+def test_zeroed_and_missing_rows_are_no_models():
+    mean = {"fps": 50.0, "psnr_box": 21.0, "lpips": None, "gaussians": 100.0, "passed": 1.0}
+    row = {"label": "full", "settings": {}, "zeroed": [], "mean": mean}
+    rows = [row, row | {"label": "again"}, row | {"zeroed": ["state"], "settings": {"a": 1}}]
+    rows.append(row | {"settings": {"b": 1}, "mean": dict.fromkeys(mean)})
+    assert points_of({"table": {"rows": rows}}) == [Point("full", 20.0, 21.0, None, 100.0, 1.0)]
+
+
+def test_the_picture_names_every_model(tmp_path):
+    pytest.importorskip("matplotlib")
+    from matplotlib import rc_context
+
+    with rc_context({"svg.fonttype": "none"}):
+        path = draw_chart(POINTS, tmp_path / "new" / "chart.svg")
+    words = {element.text for element in ElementTree.parse(path).iter() if element.text}
+    assert {point.label for point in POINTS} <= words
