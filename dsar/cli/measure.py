@@ -53,6 +53,8 @@ class Eval(Common):
         summary = summarize_tables(study, tables)
         self.write_json({"complete": complete, "minutes": self.minutes, "tables": summary})
         sys.stdout.write(to_markdown(summary))
+        if not complete:
+            sys.stdout.write("\nNot complete: the same command goes on with what is missing.\n")
         points = points_of(summary)
         if self.chart is not None and points:
             draw_chart(points, self.chart)
