@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -34,11 +33,10 @@ class Common:
 
     def write_json(self, content: dict) -> None:
         """Write the --json file, if one was asked for."""
+        from dsar.training.checkpoint import write_whole
+
         if self.json is not None:
-            draft = self.json.with_name(self.json.name + ".tmp")
-            draft.parent.mkdir(parents=True, exist_ok=True)
-            draft.write_text(json.dumps(content, indent=2) + "\n")
-            os.replace(draft, self.json)
+            write_whole(self.json, json.dumps(content, indent=2) + "\n")
 
 
 def shown(sequence: GaussianSequence, style: ProgressStyle, title: str) -> GaussianSequence:

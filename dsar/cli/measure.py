@@ -1,5 +1,6 @@
 """`dsar eval` and `dsar stress`."""
 
+import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from dsar.cli.common import Common, capture_sequence
-from dsar.cli.previews import write_findings, write_worst
+from dsar.cli.previews import write_worst
 from dsar.console import Bar, follow
 
 
@@ -63,7 +64,8 @@ class Eval(Common):
         """Measure one run."""
         from dsar.data.capture import open_capture
         from dsar.evaluation.heldout import evaluate
-        from dsar.training.checkpoint import Run, load_checkpoint, newest_run
+        from dsar.evaluation.report import write_report
+        from dsar.training.checkpoint import Run, load_checkpoint, newest_run, write_whole
 
         self.check_device()
         run = Run(self.run_folder) if self.run_folder else newest_run()
@@ -71,7 +73,8 @@ class Eval(Common):
         figures = evaluate(avatar, open_capture(config.capture))
         self.write_json(figures)
         write_worst(run.folder, figures["worst"])
-        write_findings(run.folder, "figures.json", figures)
+        write_whole(run.figures, json.dumps(figures, indent=2) + "\n")
+        write_report(run)
         for split, values in figures["splits"].items():
             if values is not None:
                 keys = ("psnr", "psnr_box", "psnr_box_template", "ssim")
@@ -91,8 +94,9 @@ class Stress(Common):
     def run(self) -> None:
         """Run the battery on the held-out motion that is furthest from training; print each verdict."""
         from dsar.data.capture import open_capture
+        from dsar.evaluation.report import write_report
         from dsar.evaluation.stress import CASES, stress
-        from dsar.training.checkpoint import Run, load_checkpoint, newest_run
+        from dsar.training.checkpoint import Run, load_checkpoint, newest_run, write_whole
 
         self.check_device()
         run = Run(self.run_folder) if self.run_folder else newest_run()
@@ -108,4 +112,5 @@ class Stress(Common):
         sys.stdout.write(f"{survived} of {len(found)} passed\n")
         battery = {"cases": found, "survived": survived, "tried": len(found)}
         self.write_json(battery)
-        write_findings(run.folder, "stress.json", battery)
+        write_whole(run.stress, json.dumps(battery, indent=2) + "\n")
+        write_report(run)

@@ -1,9 +1,7 @@
 """What a person looks at first: sheets of held-out views, a video beside the truth, the report."""
 
 import importlib.util
-import json
 import logging
-import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -27,17 +25,6 @@ def write_previews(folder: Path) -> Path:
         _log.info('No compare.mp4: package imageio-ffmpeg is missing, pip install "dsar-avatar[video]"')
     write_report(Run(folder))
     return sheet
-
-
-def write_findings(folder: Path, name: str, found: dict[str, Any]) -> None:
-    """Write what a command found into a run's folder, and its report anew."""
-    from dsar.evaluation.report import write_report
-    from dsar.training.checkpoint import Run
-
-    draft = folder / f"{name}.tmp"
-    draft.write_text(json.dumps(found, indent=2) + "\n")
-    os.replace(draft, folder / name)
-    write_report(Run(folder))
 
 
 def write_contact_sheet(folder: Path) -> Path:

@@ -7,12 +7,11 @@ from functools import partial
 
 import numpy as np
 import torch
-from jaxtyping import UInt8
 from torch import Tensor
 
 from dsar.avatar.avatar import Avatar
 from dsar.avatar.rollout import roll_out
-from dsar.evaluation.frechet import CLIP, find_i3d, frechet_distance, i3d_features, slice_features
+from dsar.evaluation.frechet import CLIP, Film, find_i3d, frechet_distance, i3d_features, slice_features
 from dsar.evaluation.views import render_white, to_bytes, true_view
 from dsar.evaluation.vmaf import vmaf, vmaf_missing
 from dsar.network import STREAMS, Stream
@@ -20,25 +19,17 @@ from dsar.training.lpips import find_lpips_weights, load_lpips
 from dsar.types import Capture
 
 FILM_METRICS = ("vmaf", "frechet_slices", "fvd")
-Film = UInt8[np.ndarray, "f h w 3"]
 
 
 @torch.no_grad()
 def record(
-    avatar: Avatar, capture: Capture, sequence: str, streams: Collection[Stream] = STREAMS
-) -> list[tuple[Film, Film]]:
-    """Return the avatar's film and the true one of each camera."""
-    cameras, made = capture.cameras, []
-    for _, gaussians in roll_out(avatar, capture.motions[sequence], streams=streams):
-        made.append([to_bytes(render_white(gaussians, camera)) for camera in cameras])
-    true = [
-        [to_bytes(true_view(capture, sequence, frame, index).color) for index in range(len(cameras))]
-        for frame in range(len(made))
-    ]
-    return [
-        (np.stack([row[index] for row in made]), np.stack([row[index] for row in true]))
-        for index in range(len(cameras))
-    ]
+    avatar: Avatar, capture: Capture, sequence: str, camera: int, streams: Collection[Stream] = STREAMS
+) -> tuple[Film, Film]:
+    """Return the avatar's film and the true one, from one camera of the capture."""
+    rollout = roll_out(avatar, capture.motions[sequence], streams=streams)
+    made = [to_bytes(render_white(gaussians, capture.cameras[camera])) for _, gaussians in rollout]
+    true = [to_bytes(true_view(capture, sequence, frame, camera).color) for frame in range(len(made))]
+    return np.stack(made), np.stack(true)
 
 
 def evaluate_films(
@@ -52,7 +43,9 @@ def evaluate_films(
     scores: dict[str, list[float]] = defaultdict(list)
     features: dict[tuple[str, str], list[tuple[Tensor, Tensor]]] = defaultdict(list)
     for sequence in {name: None for names in splits.values() for name in names}:
-        for made, true in record(avatar, capture, sequence, streams):
+        # One camera's films in memory at a time: a real capture's would fill it.
+        for camera in range(len(capture.cameras)):
+            made, true = record(avatar, capture, sequence, camera, streams)
             if "vmaf" not in skipped:
                 scores[sequence].append(vmaf(made, true))
             for metric, judge in judges.items() if len(made) >= CLIP else ():

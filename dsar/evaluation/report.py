@@ -16,7 +16,7 @@ from jinja2 import Environment, StrictUndefined
 from plotly.offline import get_plotlyjs
 
 from dsar.config import PRESETS, TrainConfig, config_from_json, config_to_json
-from dsar.training.checkpoint import Run, read_progress
+from dsar.training.checkpoint import Run, read_progress, write_whole
 
 _STAGES = {"template": "#9aa5b1", "imitation": "#c77d0a", "pose": "#4c78a8", "autoregressive": "#2a7f62"}
 _METRICS = ("psnr", "psnr_box", "psnr_box_template", "ssim", "lpips", "flip", "tpsnr", "warp_error", "vmaf")
@@ -34,7 +34,7 @@ def write_report(run: Run) -> Path:
     `dsar stress` leave (figures.json, stress.json).
     """
     config, lines = config_from_json(run.config), _lines(run)
-    figures, battery = (_read(run.folder / name) for name in ("figures.json", "stress.json"))
+    figures, battery = map(_read, (run.figures, run.stress))
     splits = {name: values for name, values in (figures or {}).get("splits", {}).items() if values}
     metrics = [key for key in _METRICS if any(values.get(key) is not None for values in splits.values())]
     facts = {
@@ -59,11 +59,8 @@ def write_report(run: Run) -> Path:
     engine = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
     engine.filters["figure"] = _figure
     source = Path(__file__).with_name("report.html.jinja").read_text()
-    path = run.folder / "report.html"
-    draft = path.with_suffix(".tmp")
-    draft.write_text(engine.from_string(source).render(facts))
-    os.replace(draft, path)
-    return path
+    write_whole(run.report, engine.from_string(source).render(facts))
+    return run.report
 
 
 def changed_settings(config: TrainConfig) -> dict[str, tuple[Any, Any]]:
@@ -74,7 +71,7 @@ def changed_settings(config: TrainConfig) -> dict[str, tuple[Any, Any]]:
 
 def _previews(run: Run) -> Iterator[dict[str, Any]]:
     for name, title, note in _PREVIEWS:
-        path = run.folder / "previews" / name
+        path = run.previews / name
         if path.exists():
             kind = mimetypes.guess_type(name)[0] or ""
             data = f"data:{kind};base64,{base64.b64encode(path.read_bytes()).decode()}"

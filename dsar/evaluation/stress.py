@@ -5,6 +5,7 @@ body's pose nor its place shows.
 """
 
 import math
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -86,8 +87,13 @@ def run_cycle(avatar: Avatar, motion: Motion, cycles: int = 100) -> Verdict:
     The curve is that difference, cycle by cycle, mm.
     """
     sway, period = swaying(motion, cycles)
-    offsets = torch.stack(list(_offsets(avatar, sway))).reshape(cycles, period, -1, 3)
-    apart = _distance(offsets[1:], offsets[:-1]).square().mean(1).sqrt()
+    last: deque[Tensor] = deque(maxlen=period)
+    distances = []
+    for offset in _offsets(avatar, sway):
+        if len(last) == period:
+            distances.append(_distance(offset, last[0]))
+        last.append(offset)
+    apart = torch.stack(distances).reshape(cycles - 1, period).square().mean(1).sqrt()
     return Verdict(_finite(apart[4:].median()), 0.5, "mm", _curve(apart))
 
 

@@ -7,6 +7,8 @@ checkpoint/              replaced as a whole, never half written
     rollouts-<rank>.safetensors, rollouts-<rank>.json   carried state of each worker's rollouts
     progress.json            step, progress, format version
 metrics.jsonl            one line per report
+figures.json, stress.json   what `dsar eval` and `dsar stress` found
+previews/, report.html   for people
 """
 
 import dataclasses
@@ -50,6 +52,26 @@ class Run:
         return self.folder / "metrics.jsonl"
 
     @property
+    def figures(self) -> Path:
+        """What `dsar eval` found."""
+        return self.folder / "figures.json"
+
+    @property
+    def stress(self) -> Path:
+        """What `dsar stress` found."""
+        return self.folder / "stress.json"
+
+    @property
+    def report(self) -> Path:
+        """The page that shows all of it."""
+        return self.folder / "report.html"
+
+    @property
+    def previews(self) -> Path:
+        """Folder of sheets and videos."""
+        return self.folder / "previews"
+
+    @property
     def checkpoint(self) -> Path:
         """The newest complete checkpoint."""
         return self.folder / "checkpoint"
@@ -58,6 +80,14 @@ class Run:
     def exists(self) -> bool:
         """Whether the run has a checkpoint."""
         return (self.checkpoint / "progress.json").exists()
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a text file whole or not at all; its folder is made if missing."""
+    draft = path.with_name(path.name + ".tmp")
+    draft.parent.mkdir(parents=True, exist_ok=True)
+    draft.write_text(text)
+    os.replace(draft, path)
 
 
 def newest_run(root: Path = Path("runs")) -> Run:

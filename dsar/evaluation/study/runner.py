@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from dsar.evaluation.heldout import evaluate
 from dsar.evaluation.stress import stress
 from dsar.evaluation.study.tables import Row, Table
 from dsar.network import STREAMS, Stream
-from dsar.training.checkpoint import Run, load_checkpoint, read_progress
+from dsar.training.checkpoint import Run, load_checkpoint, read_progress, write_whole
 from dsar.training.loop import train
 from dsar.training.report import Report
 
@@ -152,10 +151,7 @@ class Study:
             far = (capture.splits.get("fd") or capture.splits["test"])[0]
             verdicts = stress(avatar, capture.motions[far])
             found["stress"] = {name: verdict.to_json() for name, verdict in verdicts}
-        path = self._figures(each)
-        draft = path.with_suffix(".tmp")
-        draft.write_text(json.dumps(found, indent=1) + "\n")
-        os.replace(draft, path)
+        write_whole(self._figures(each), json.dumps(found, indent=1) + "\n")
 
 
 def _follow(report: Reporter, what: str, done: int, needed: int, line: Report) -> None:
