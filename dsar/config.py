@@ -113,6 +113,8 @@ class LossConfig:
     spatial: float = 0.0003
     """Squared difference of the offsets, in cm, of neighbours on the surface (extension): colours repeat
     in a print, so they alone pair cloth with the wrong place; cloth moves together."""
+    shape: float = 0.001
+    """The same of the template's own shape: how far neighbouring texels part from the garment's chart."""
     registered: float = 0.04
     """Distance in cm to the registered maps while images are compared (extension)."""
     feature: float = 0.01
@@ -279,6 +281,7 @@ PRESETS: dict[str, TrainConfig] = {
             lpips=0.5,
             alpha=0.0,
             spatial=0.0,
+            shape=0.0,
             registered=0.0,
             temporal_scale=1.0,
             magnitude="frame",

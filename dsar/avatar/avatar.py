@@ -81,7 +81,7 @@ class Avatar(nn.Module):
         self.register_buffer("texel_axes", axes.contiguous(), persistent=False)
         self.register_buffer("control_axes", axes[nearest], persistent=False)
         rows, columns = atlas.texels // atlas.width, atlas.texels % atlas.width
-        taps = bilinear_taps(rows, columns, model.upsample, size)
+        taps = bilinear_taps(rows, columns, model.upsample, size, self._body_rows)
         self.register_buffer("tap_cells", taps[0], persistent=False)
         self.register_buffer("tap_weights", taps[1], persistent=False)
         self.register_buffer("map_mean", torch.zeros(model.map_channels, 1, 1))
@@ -207,6 +207,18 @@ class Avatar(nn.Module):
         self.template.opacity_logits[self.texel_hidden] = SHOWN
         self.texel_hidden.fill_(False)
 
+    def at_points(self, offset: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b p 3"]:
+        """Return a map's offsets at the control points, along their own axes, metres."""
+        return offset.flatten(2)[:, :, self.cells].transpose(1, 2)
+
+    def offset_garment(self, offsets: Float[Tensor, "b g 3"]) -> NetworkOutput:
+        """Return an output that moves the garment's control points by these offsets, and nothing else."""
+        batch, (h, w) = len(offsets), self.grid_size
+        cells = self.cells[self.garment_points()]
+        flat = offsets.new_zeros(batch, 3, h * w).index_copy(2, cells, offsets.transpose(1, 2))
+        looks = offsets.new_zeros(batch, self.model.appearance_channels, h, w)
+        return NetworkOutput(flat.unflatten(2, (h, w)), looks, ())
+
     def standardized(self, observed: FrameMaps) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 1 h w"]]:
         """Return input maps and motion magnitude as the network takes them."""
         maps = (observed.maps - self.map_mean) / self.map_scale * self.network.occupied
@@ -242,8 +254,9 @@ class Avatar(nn.Module):
         self, context: Float[Tensor, "b t j 4 4"], output: NetworkOutput
     ) -> Float[Tensor, "b p 3"]:
         """Return the newest frame's control points, offset and posed, world metres."""
-        offset = output.offset.flatten(2)[:, :, self.cells].transpose(1, 2)
-        points = self.control_points + (self.control_axes * offset[..., None, :]).sum(-1)
+        points = self.control_points + (self.control_axes * self.at_points(output.offset)[..., None, :]).sum(
+            -1
+        )
         blended = blend(self.control_weights, context[:, :1])[:, 0]
         return (blended[..., :3] * points[..., None, :]).sum(-1) + blended[..., 3]
 

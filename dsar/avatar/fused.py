@@ -22,19 +22,26 @@ _SMALLEST, _LARGEST = map(np.float32, SCALE_RANGE)
 
 
 def bilinear_taps(
-    rows: Tensor, columns: Tensor, upsample: int, size: tuple[int, int]
+    rows: Tensor, columns: Tensor, upsample: int, size: tuple[int, int], square: int
 ) -> tuple[Int32[Tensor, "n 4"], Float[Tensor, "n 4"]]:
-    """Return the four grid cells (flat) around each texel and their bilinear weights, clamped at the border.
+    """Return the four grid cells (flat) around each texel and their bilinear weights.
+
+    Charts end where they end: nothing is sampled from the other one. The body's is clamped on all sides; the
+    garment's, from texel row `square` on, is a tube, whose first column follows its last.
 
     `rows` and `columns` count texels; a cell covers `upsample` x `upsample` of them.
     """
-    lines = []
-    for texel, count in ((rows, size[0]), (columns, size[1])):
-        place = ((texel + 0.5) / upsample - 0.5).clamp(0, count - 1)
-        low = place.floor().long()
-        lines.append((low, (low + 1).clamp_max(count - 1), place - low))
-    (top, bottom, down), (left, right, across) = lines
-    cells = torch.stack([y * size[1] + x for y in (top, bottom) for x in (left, right)], -1)
+    tube, (height, width) = rows >= square, size
+    down, across = ((texel + 0.5) / upsample - 0.5 for texel in (rows, columns))
+    first = torch.where(tube, square // upsample, 0)
+    last = torch.where(tube, height, min(square // upsample, height)) - 1
+    down = torch.minimum(torch.maximum(down, first), last)
+    across = torch.where(tube, across, across.clamp(0, width - 1))
+    top, left = down.floor().long(), across.floor().long()
+    bottom, right = torch.minimum(top + 1, last), left + 1
+    down, across = down - top, across - left
+    left, right = (torch.where(tube, edge % width, edge.clamp_max(width - 1)) for edge in (left, right))
+    cells = torch.stack([y * width + x for y in (top, bottom) for x in (left, right)], -1)
     weights = torch.stack([v * u for v in (1 - down, down) for u in (1 - across, across)], -1)
     return cells.int(), weights.float()
 

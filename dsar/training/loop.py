@@ -27,13 +27,14 @@ from dsar.training.lpips import load_lpips
 from dsar.training.optimizers import make_optimizers, set_rates
 from dsar.training.registration import Registration
 from dsar.training.report import REPORT_EVERY, Monitor, Reporter
+from dsar.training.rest import RestShapes
 from dsar.training.segment import Progress, SegmentTrainer
 from dsar.training.stages import Position, position
 from dsar.types import Capture
 
 SAVE_EVERY = 200
 """Updates between checkpoints (not seconds: all workers must agree)."""
-STILL_FRAMES = 48
+STILL_FRAMES = 16
 """Near-rest frames that the template is fitted to."""
 PROBE_EVERY = 100
 """Updates between comparisons of the losses' gradients, each of which costs as much as some updates."""
@@ -90,11 +91,11 @@ def _train(config: TrainConfig, folder: Path, resume: bool, report: Reporter | N
         avatar = Avatar.from_capture(capture, body, config.atlas, config.model)
     lpips = load_lpips("alex") if config.loss.lpips else None
     trainer = SegmentTrainer(config, capture, avatar.train(), training_clips(config, capture), lpips)
-    registration = Registration(config, capture, avatar, trainer.tracks, trainer.streams.clips)
-    still = still_frames(trainer, avatar.fps)
+    rest = RestShapes(avatar, still_frames(trainer, avatar.fps))
+    registration = Registration(config, capture, avatar, rest, trainer.tracks, trainer.streams.clips)
     schedule = registration.reduced(config.schedule)
-    optimizers = make_optimizers(avatar, config.schedule)
-    gradients = workers.Gradients(list(avatar.parameters()))
+    optimizers = make_optimizers(avatar, rest, config.schedule)
+    gradients = workers.Gradients([*avatar.parameters(), *rest.parameters()])
     step, progress = 0, 0.0
     if resume:
         at = ckpt.read_progress(run)
@@ -120,7 +121,7 @@ def _train(config: TrainConfig, folder: Path, resume: bool, report: Reporter | N
             set_rates(optimizers, now)
             rng = np.random.default_rng([config.seed, workers.rank(), step])
             gradients.clear()
-            done = _segment(trainer, still, rng, now, step)
+            done = _segment(trainer, rest, rng, now, step)
             monitor.update(done)
             before, (stop, used) = used, gradients.average(bool(received), clock.used())
             if not gradients.buffer.isfinite().all():
@@ -167,7 +168,7 @@ def _register(
 
 def _segment(
     trainer: SegmentTrainer,
-    still: list[tuple[str, int]],
+    rest: RestShapes,
     rng: np.random.Generator,
     now: Position,
     step: int,
@@ -175,7 +176,7 @@ def _segment(
     """Compute the gradients of one update."""
     try:
         if now.stage == "template":
-            return trainer.template_segment(rng, still, now.reduction)
+            return trainer.template_segment(rng, rest, now.reduction)
         if now.stage == "imitation":
             return trainer.imitation_segment(rng)
         return trainer.segment(rng, now, probe=workers.rank() == 0 and step % PROBE_EVERY == 0)

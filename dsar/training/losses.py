@@ -16,7 +16,7 @@ from dsar.training.targets import Target
 from dsar.types import RenderOutput
 
 _GAMMA = 0.1
-_CENTIMETRES = 100.0
+CENTIMETRES = 100.0
 _KNEE = 0.5
 """Centimetres below which a distance is squared after all, to be smooth."""
 _SSIM_WINDOW, _SSIM_SIGMA = 11, 1.5
@@ -93,23 +93,23 @@ def image_loss(
     return loss, (output.color - truth).detach().square().mean()
 
 
-def spatial_loss(
-    offset: Float[Tensor, "b 3 h w"], cells: Int64[Tensor, " p"], links: Int64[Tensor, "l 2"]
-) -> Float[Tensor, ""]:
-    """Return the mean squared difference, cm, of the offsets of linked control points (flat `cells`)."""
-    offsets = offset.flatten(2)[:, :, cells] * _CENTIMETRES
-    return (offsets[:, :, links[:, 0]] - offsets[:, :, links[:, 1]]).square().sum(1).mean()
+def spatial_loss(offsets: Float[Tensor, "b p 3"], links: Int64[Tensor, "l 2"]) -> Float[Tensor, ""]:
+    """Return the mean squared difference, in cm, of the offsets of linked points; 0 without links."""
+    if not len(links):
+        return offsets.new_zeros(())
+    change = (offsets[:, links[:, 0]] - offsets[:, links[:, 1]]) * CENTIMETRES
+    return change.square().sum(2).mean()
 
 
 def registered_loss(
-    offset: Float[Tensor, "b 3 h w"], registered: Float[Tensor, "b 3 h w"], cells: Int64[Tensor, " p"]
+    offsets: Float[Tensor, "b p 3"], registered: Float[Tensor, "b p 3"]
 ) -> Float[Tensor, " b"]:
-    """Return the mean distance, cm, of the offsets at the control points (flat `cells`) to registered ones.
+    """Return the mean distance, in cm, of the control points' offsets to registered ones.
 
     Not squared: at rest the last millimetres count, in a spin the map itself is centimetres off.
     """
-    error = (offset - registered).flatten(2)[:, :, cells] * _CENTIMETRES
-    return ((error.square().sum(1) + _KNEE**2).sqrt() - _KNEE).mean(1)
+    error = (offsets - registered) * CENTIMETRES
+    return ((error.square().sum(2) + _KNEE**2).sqrt() - _KNEE).mean(1)
 
 
 @dataclass(frozen=True)
@@ -162,7 +162,7 @@ def temporal_losses(
     apart = torch.stack([over_rollouts((current - past).square(), one) for current, past in pairs])
     losses["feature"] = scale * config.feature * _GAMMA * apart.sum()
     if len(records) > 2:
-        acceleration = (newest.posed - 2 * previous.posed + records[-3].posed) * _CENTIMETRES
+        acceleration = (newest.posed - 2 * previous.posed + records[-3].posed) * CENTIMETRES
         # It is the acceleration of the frame in the middle (equations 20-21).
         jolt = weights[-2].flatten(1)[:, cells] * acceleration.square().sum(-1)
         losses["smoothness"] = scale * config.smoothness * over_rollouts(jolt, two)
@@ -188,6 +188,6 @@ def _have_seen(ages: list[int], past: int, like: Tensor) -> Float[Tensor, " b"]:
 
 def _change(current: NetworkOutput, past: NetworkOutput) -> Float[Tensor, "b 1 h w"]:
     """Return the squared change of offset (cm), quaternion and log-scale between frames (equation 19)."""
-    moved = (current.offset - past.offset) * _CENTIMETRES
+    moved = (current.offset - past.offset) * CENTIMETRES
     turned = current.appearance[:, :7] - past.appearance[:, :7]
     return moved.square().sum(1, keepdim=True) + turned.square().sum(1, keepdim=True)

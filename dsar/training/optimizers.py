@@ -7,6 +7,7 @@ import torch
 from dsar.avatar.avatar import Avatar
 from dsar.config import ScheduleConfig
 from dsar.training.muon import Muon
+from dsar.training.rest import RestShapes
 from dsar.training.stages import Position
 
 _TEMPLATE_RATES = {
@@ -18,25 +19,36 @@ _TEMPLATE_RATES = {
 }
 
 
-def make_optimizers(avatar: Avatar, schedule: ScheduleConfig) -> Mapping[str, torch.optim.Optimizer]:
+_TRAVEL = 10.0
+"""Factor on the means' rate while the template is fitted: the garment's chart is centimetres off."""
+_REST_RATE = 3e-3
+
+
+def make_optimizers(
+    avatar: Avatar, rest: RestShapes, schedule: ScheduleConfig
+) -> Mapping[str, torch.optim.Optimizer]:
     """Return Muon for the network's hidden convolutions and Adam for all else; rates are set each update.
 
     Adam's epsilon is far below the default: inner gradients of this network are smaller than 1e-8.
     """
     hidden = avatar.network.hidden_weights() if schedule.matrix_rate else []
     chosen = {id(weight) for weight in hidden}
-    rest = [p for p in avatar.network.parameters() if id(p) not in chosen]
-    groups = [{"params": rest, "name": "network"}]
+    others = [p for p in avatar.network.parameters() if id(p) not in chosen]
+    groups = [{"params": others, "name": "network"}]
     groups += [{"params": [p], "name": name} for name, p in avatar.template.named_parameters()]
+    groups += [{"params": list(rest.parameters()), "name": "rest"}]
     adam = torch.optim.Adam(groups, lr=0.0, betas=(0.9, 0.99), eps=1e-15, fused=True)
     return {"adam": adam} | ({"muon": Muon(hidden)} if hidden else {})
 
 
 def set_rates(optimizers: Mapping[str, torch.optim.Optimizer], now: Position) -> None:
     """Set the learning rates of this update."""
+    fitting = now.stage == "template"
+    rates = {name: rate * now.template_factor for name, rate in _TEMPLATE_RATES.items()}
+    rates["means"] *= _TRAVEL if fitting else 1.0
+    rates |= {"network": now.network_rate, "rest": _REST_RATE * now.template_factor * fitting}
     for group in optimizers["adam"].param_groups:
-        name = group["name"]
-        group["lr"] = now.network_rate if name == "network" else _TEMPLATE_RATES[name] * now.template_factor
+        group["lr"] = rates[group["name"]]
     if "muon" in optimizers:
         for group in optimizers["muon"].param_groups:
             group["lr"] = now.matrix_rate

@@ -21,6 +21,7 @@ from dsar.network import NetworkOutput
 from dsar.raster import rasterize, reduced_dilation
 from dsar.training import workers
 from dsar.training.losses import image_loss, spatial_loss
+from dsar.training.rest import RestShapes
 from dsar.training.segment import Progress
 from dsar.training.targets import Target, load_target
 from dsar.types import Capture
@@ -29,9 +30,9 @@ REDUCTION = 2
 """Factor by which images are reduced."""
 LIMIT = 0.4
 """Largest share of a budget of time; frames that are left by then stay without a map."""
-RATE, FAST_RATE = 0.01, 0.02
+RATE, FAST_RATE = 0.01, 0.025
 """Adam's step, metres, usually and where the cloth is fast."""
-STEPS = 6
+STEPS = 12
 """Steps of Adam a frame."""
 VIEWS, FAST_VIEWS = 2, 4
 """Cameras of a step, likewise."""
@@ -58,11 +59,13 @@ class Registration:
         config: TrainConfig,
         capture: Capture,
         avatar: Avatar,
+        rest: RestShapes,
         tracks: Mapping[str, Float[Tensor, "_ t j 4 4"]],
         clips: Mapping[str, range],
     ) -> None:
         """Prepare to fit the frames of `clips`, of which each worker gets its share."""
         self.capture, self.avatar, self.tracks, self.seed = capture, avatar, tracks, config.seed
+        self.rest = rest
         self.schedule = config.schedule
         self.loss = dataclasses.replace(config.loss, **STRUCTURE)
         self.garment = avatar.garment_points()
@@ -109,12 +112,15 @@ class Registration:
         """Return what must survive a restart."""
         tensors = {f"map.{name}": maps for name, maps in self.maps.items()}
         tensors |= {f"fitted.{name}": fitted for name, fitted in self.fitted.items()}
+        tensors["rest"] = self.rest.offsets.detach()
         return tensors | {"count": torch.tensor(self.count), "used": torch.tensor(self.used)}
 
     def carry_on(self, tensors: Mapping[str, Tensor]) -> None:
         """Restore what `carried` returned."""
         self.maps = {name: tensors[f"map.{name}"] for name in self.maps}
         self.fitted = {name: tensors[f"fitted.{name}"] for name in self.fitted}
+        with torch.no_grad():
+            self.rest.offsets.copy_(tensors["rest"])
         self.count, self.used = int(tensors["count"]), float(tensors["used"])
 
     def advance(self) -> Progress | None:
@@ -165,10 +171,10 @@ class Registration:
         Rest is among them, so that a print that was lost is found again when the cloth comes to rest.
         """
         garment, seen = self.garment, frame - self.starts[name]
-        rest = torch.zeros(len(garment), 3)
+        rest = self.rest.first(name)
         if seen == 0:
             return [rest], False
-        before = self.maps[name][frame - 1].flatten(1)[:, self.avatar.cells[garment]].T
+        before = self.avatar.at_points(self.maps[name][[frame - 1]])[0, garment]
         if seen == 1:
             return [before, rest], False
         change = self._inertia(context, name, frame) - before
@@ -208,7 +214,7 @@ class Registration:
         return loss + ROUGHNESS * self._roughness(maps), mse
 
     def _roughness(self, maps: Float[Tensor, "1 3 h w"]) -> Float[Tensor, ""]:
-        return spatial_loss(maps, self.avatar.cells, self.avatar.links)
+        return spatial_loss(self.avatar.at_points(maps), self.avatar.links)
 
     def _view(self, name: str, frame: int, camera: int, points: Float[Tensor, "g 3"]) -> tuple[Target, float]:
         """Return a view of the garment around its points in the world, and its share of the person's view."""
@@ -223,9 +229,7 @@ class Registration:
         return part, alpha.numel() / target.alpha.numel()
 
     def _map(self, offset: Float[Tensor, "g 3"]) -> Float[Tensor, "1 3 h w"]:
-        h, w = self.avatar.grid_size
-        flat = offset.new_zeros(3, h * w).index_copy(1, self.avatar.cells[self.garment], offset.T)
-        return flat.reshape(1, 3, h, w)
+        return self.avatar.offset_garment(offset[None]).offset
 
     def _posed(self, context: Tensor, maps: Float[Tensor, "1 3 h w"]) -> Float[Tensor, "g 3"]:
         """Return where the garment's control points are in the world."""

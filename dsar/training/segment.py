@@ -18,6 +18,7 @@ from dsar.network import STREAMS, NetworkOutput, NetworkState, Stream
 from dsar.network.maps import FrameMaps
 from dsar.raster import rasterize, reduced_dilation
 from dsar.training.losses import TemporalRecord, image_loss, registered_loss, spatial_loss, temporal_losses
+from dsar.training.rest import RestShapes
 from dsar.training.stages import WHOLE_CLIP, Position
 from dsar.training.streams import Place, Streams
 from dsar.training.targets import load_target
@@ -84,18 +85,17 @@ class SegmentTrainer:
         self.speeds: deque[Tensor] = deque(maxlen=max(2, config.model.window))
         """Motion magnitudes of the window's frames, oldest first."""
 
-    def template_segment(
-        self, rng: np.random.Generator, still: list[tuple[str, int]], reduction: int
-    ) -> Progress:
-        """Back-propagate views of the template alone on still frames."""
-        loss, mse = torch.zeros(()), torch.zeros(())
-        for index in rng.choice(len(still), TEMPLATE_FRAMES):
-            name, frame = still[index]
-            context = self.tracks[name][[frame]]
-            gaussians = self.avatar.gaussians(context, None)[0]
+    def template_segment(self, rng: np.random.Generator, rest: RestShapes, reduction: int) -> Progress:
+        """Back-propagate views of the template in the shapes it has in still frames."""
+        count = TEMPLATE_FRAMES * self.config.schedule.views
+        loss, mse = count * rest.loss(self.avatar, self.config.loss), torch.zeros(())
+        for index in rng.choice(len(rest.frames), TEMPLATE_FRAMES):
+            name, frame = rest.frames[index]
+            output = rest.output(self.avatar, int(index))
+            gaussians = self.avatar.gaussians(self.tracks[name][[frame]], output)[0]
             view = self._views(rng, gaussians, name, frame, reduction)
             loss, mse = loss + view[0], mse + view[1]
-        return self._finish(loss, mse, TEMPLATE_FRAMES * self.config.schedule.views)
+        return self._finish(loss, mse, count)
 
     def imitation_segment(self, rng: np.random.Generator) -> Progress:
         """Advance every rollout by K frames and back-propagate the distance to the registered maps."""
@@ -209,7 +209,8 @@ class SegmentTrainer:
         return loss, mse
 
     def _spatial(self, output: NetworkOutput) -> Tensor:
-        return self.config.loss.spatial * spatial_loss(output.offset, self.avatar.cells, self.avatar.links)
+        offsets = self.avatar.at_points(output.offset)
+        return self.config.loss.spatial * spatial_loss(offsets, self.avatar.links)
 
     def _registered(self, step: "_Step") -> Tensor:
         """Return the mean distance, cm, to the registered maps; frames without one count as reached."""
@@ -218,7 +219,8 @@ class SegmentTrainer:
             self.registered[place.sequence][1][place.frame] if has else torch.zeros_like(answer)
             for has, place, answer in zip(known, step.places, step.answer.offset, strict=True)
         ]
-        distances = registered_loss(step.answer.offset, torch.stack(maps), self.avatar.cells)
+        answers, wanted = map(self.avatar.at_points, (step.answer.offset, torch.stack(maps)))
+        distances = registered_loss(answers, wanted)
         return (distances * torch.tensor(known)).mean()
 
     def _compare_gradients(self, losses: Mapping[str, Tensor]) -> dict[str, float] | None:

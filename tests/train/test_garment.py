@@ -12,6 +12,7 @@ from dsar.data.capture import open_capture
 from dsar.evaluation.garment import measure_garment
 from dsar.raster import rasterize
 from dsar.training.optimizers import make_optimizers, set_rates
+from dsar.training.rest import RestShapes
 from dsar.training.segment import SegmentTrainer
 from dsar.training.stages import Position
 from dsar.training.workers import Gradients
@@ -102,7 +103,7 @@ def test_the_network_trains_with_the_whole_body_the_template_without_what_is_ben
     trainer = SegmentTrainer(config, capture, avatar, {"sway": range(3)}, None)
     hidden = avatar.texel_hidden.clone()
     Gradients(list(avatar.parameters())).clear()
-    trainer.template_segment(np.random.default_rng(0), [("sway", 0)], 2)
+    trainer.template_segment(np.random.default_rng(0), RestShapes(avatar, [("sway", 0)]), 2)
     for name, parameter in avatar.template.named_parameters():
         assert parameter.grad[~hidden].any(), name
         assert not parameter.grad[hidden].any(), name
@@ -132,17 +133,18 @@ def test_one_fitted_frame_covers_the_mask(capture, sequence, frame):
     avatar = Avatar.from_capture(capture, capture.body, config.atlas, config.model).train()
     avatar.reveal()
     trainer = SegmentTrainer(config, capture, avatar, {sequence: range(frame + 1)}, None)
-    optimizers = make_optimizers(avatar, config.schedule)
-    gradients = Gradients(list(avatar.parameters()))
+    rest = RestShapes(avatar, [(sequence, frame)])
+    optimizers = make_optimizers(avatar, rest, config.schedule)
+    gradients = Gradients([*avatar.parameters(), *rest.parameters()])
     for step in range(110):
         reduction, factor = (2, 1.0) if step < 50 else (1, 0.5)
         set_rates(optimizers, Position("template", 1, reduction, 0.0, 0.0, factor))
         gradients.clear()
-        trainer.template_segment(np.random.default_rng(step), [(sequence, frame)], reduction)
+        trainer.template_segment(np.random.default_rng(step), rest, reduction)
         optimizers["adam"].step()
     solid_recall, soft_recall = [], []
     with torch.no_grad():
-        gaussians = avatar.gaussians(trainer.tracks[sequence][[frame]], None)[0]
+        gaussians = avatar.gaussians(trainer.tracks[sequence][[frame]], rest.output(avatar, 0))[0]
         for index, camera in enumerate(capture.cameras):
             truth = torch.tensor(capture.image(sequence, frame, index)[..., 3]) / 255
             alpha = rasterize(gaussians, camera).alpha

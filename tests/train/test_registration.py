@@ -1,6 +1,7 @@
 """Registered maps follow the true cloth of the embedded capture, and the network learns to follow them."""
 
 import dataclasses
+import itertools
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,9 +11,11 @@ import torch
 from dsar.avatar.avatar import Avatar
 from dsar.config import ModelConfig, TrainConfig
 from dsar.data.capture import open_capture
+from dsar.evaluation.garment import distance_to_mesh
 from dsar.training import loop
 from dsar.training.optimizers import make_optimizers, set_rates
 from dsar.training.registration import Registration, share_out
+from dsar.training.rest import PULL, RestShapes
 from dsar.training.segment import SegmentTrainer
 from dsar.training.stages import position
 from dsar.training.workers import Gradients
@@ -29,20 +32,20 @@ def registered():
     config, capture = TrainConfig(), open_capture()
     avatar = Avatar.from_capture(capture, capture.body, config.atlas, config.model)
     trainer = SegmentTrainer(config, capture, avatar, loop.training_clips(config, capture), None)
-    still = loop.still_frames(trainer, avatar.fps)
+    rest = RestShapes(avatar, loop.still_frames(trainer, avatar.fps))
     optimizers, gradients = (
-        make_optimizers(avatar, config.schedule),
-        Gradients(list(avatar.parameters())),
+        make_optimizers(avatar, rest, config.schedule),
+        Gradients([*avatar.parameters(), *rest.parameters()]),
     )
     for step in range(60):
         set_rates(optimizers, position(config.schedule, 0.12 * step / 60))
         gradients.clear()
-        trainer.template_segment(np.random.default_rng([0, step]), still, 1)
+        trainer.template_segment(np.random.default_rng([0, step]), rest, 1)
         optimizers["adam"].step()
     avatar.reveal()
     clips = {SEQUENCE: range(4, LAST + 1)}
-    registration = Registration(config, capture, avatar, trainer.tracks, clips)
-    copy = Registration(config, capture, avatar, trainer.tracks, clips)
+    registration = Registration(config, capture, avatar, rest, trainer.tracks, clips)
+    copy = Registration(config, capture, avatar, rest, trainer.tracks, clips)
     for _ in range(LAST - 5):
         registration.advance()
     copy.carry_on({name: tensor.clone() for name, tensor in registration.carried().items()})
@@ -50,6 +53,57 @@ def registered():
         while not one.complete:
             one.advance()
     return capture, avatar, registration, copy
+
+
+def test_the_template_finds_the_cloth_and_every_still_frame_has_folds_of_its_own(registered):
+    """A Gaussian lies on the same spot of the cloth in two sequences, though it hangs otherwise there."""
+    capture, avatar, registration, _ = registered
+    rest, garment = registration.rest, avatar.garment_texels()
+    faces = torch.from_numpy(capture.garment_faces("sway"))
+
+    def posed(index, output) -> tuple[torch.Tensor, torch.Tensor]:
+        sequence, frame = rest.frames[index]
+        context, cloth = registration.tracks[sequence][[frame]], capture.garment(sequence)[frame]
+        return avatar.gaussians(context, output)[0].means[garment], torch.from_numpy(cloth)
+
+    distances, own, shared = [], [], []
+    with torch.no_grad():
+        begins = {name: k for k, (name, frame) in enumerate(rest.frames) if frame == 0}
+        for here, there in itertools.permutations(
+            [begins[name] for name in ("sway", "walk", "turn_about")], 2
+        ):
+            points, cloth = posed(here, rest.output(avatar, here))
+            distances.append(distance_to_mesh(points, cloth, faces))
+            spots = cloth[faces].mean(1)
+            nearest = torch.cdist(points, spots).argmin(1)
+            moved, other = posed(there, rest.output(avatar, there))
+            carried = other[faces].mean(1)[nearest] - spots[nearest]
+            own.append((moved - points - carried).norm(dim=1))
+            shared.append((posed(there, None)[0] - posed(here, None)[0] - carried).norm(dim=1))
+    distance, own, shared = (float(torch.cat(each).mean()) for each in (distances, own, shared))
+    assert distance < 0.03
+    assert own < 0.85 * shared
+
+
+def test_what_keeps_a_garment_in_one_piece(registered):
+    _, avatar, _, _ = registered
+    rest = RestShapes(avatar, [("sway", 2), ("sway", 0), ("walk", 0)])
+    config, garment = dataclasses.replace(TrainConfig().loss, spatial=0.0), avatar.garment_texels()
+    means, fitted = avatar.template.means.data, avatar.template.means.detach().clone()
+    with torch.no_grad():
+        rest.offsets[1] = 0.01
+        try:
+            means.copy_(avatar.texel_positions)
+            # One shape of three is a centimetre off along three axes.
+            assert float(rest.loss(avatar, config)) == pytest.approx(PULL)
+            means[garment] += 0.02
+            assert float(rest.loss(avatar, config)) == pytest.approx(PULL), "moving together costs"
+            means[garment[0]] += 0.02
+            assert float(rest.loss(avatar, config)) > 1.001 * PULL
+        finally:
+            means.copy_(fitted)
+    assert torch.equal(rest.first("sway"), torch.full_like(rest.offsets[1], 0.01))
+    assert not rest.first("jumps").any()
 
 
 def distance_to_cloth(capture, avatar, registration, maps) -> float:
@@ -88,7 +142,7 @@ def test_the_network_learns_to_follow_maps_that_lag_behind_the_motion(registered
     small = Avatar.from_capture(capture, capture.body, config.atlas, model)
     trainer = SegmentTrainer(config, capture, small, {SEQUENCE: range(4, LAST + 1)}, None)
     trainer.registered = registration.result
-    optimizers = make_optimizers(small, config.schedule)
+    optimizers = make_optimizers(small, RestShapes(small, []), config.schedule)
     gradients, losses = Gradients(list(small.parameters())), []
     for step in range(60):
         set_rates(optimizers, position(config.schedule, 0.13 + 0.15 * step / 60))
@@ -112,7 +166,7 @@ def test_a_figure_without_a_garment_is_not_registered():
     config, capture = TrainConfig(), open_capture()
     bare = dataclasses.replace(config.atlas, garment="off")
     avatar = Avatar.from_capture(capture, capture.body, bare, config.model)
-    registration = Registration(config, capture, avatar, {}, {SEQUENCE: range(9)})
+    registration = Registration(config, capture, avatar, RestShapes(avatar, []), {}, {SEQUENCE: range(9)})
     assert registration.complete
     assert registration.reduced(config.schedule).imitation_share == 0
 

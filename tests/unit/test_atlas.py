@@ -68,8 +68,22 @@ def test_taps_sample_maps_as_bilinear_interpolation_does():
         grid.flatten() for grid in torch.meshgrid(torch.arange(24), torch.arange(16), indexing="ij")
     )
     expected = torch.nn.functional.interpolate(maps, size=(24, 16), mode="bilinear")
-    sampled = sample(maps, bilinear_taps(rows, columns, 4, (6, 4)))
+    sampled = sample(maps, bilinear_taps(rows, columns, 4, (6, 4), square=24))
     assert torch.allclose(sampled.mT.reshape(2, 3, 24, 16), expected, atol=1e-6)
+
+
+def test_a_garments_taps_go_round_its_tube_and_stay_off_the_body():
+    maps = torch.randn(2, 3, 6, 4, generator=torch.Generator().manual_seed(0))
+    rows, columns = (
+        grid.flatten() for grid in torch.meshgrid(torch.arange(24), torch.arange(16), indexing="ij")
+    )
+    sampled = sample(maps, bilinear_taps(rows, columns, 4, (6, 4), square=16)).mT.reshape(2, 3, 24, 16)
+    body, tube = (
+        torch.nn.functional.interpolate(part, scale_factor=4, mode="bilinear")
+        for part in (maps[:, :, :4], maps[:, :, 4:].repeat(1, 1, 1, 3))
+    )
+    assert torch.allclose(sampled[:, :, :16], body, atol=1e-6)
+    assert torch.allclose(sampled[:, :, 16:], tube[..., 16:32], atol=1e-6)
 
 
 def test_surface_frames_are_right_handed_and_point_outwards_and_up(body):

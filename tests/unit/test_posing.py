@@ -64,7 +64,7 @@ def test_fused_posing_equals_sampling_activation_and_posing_in_turn(degree):
         template.log_scales[:5] = -12.0
         template.log_scales[5:10] = 1.0
     rows, columns = torch.randint(24, (n,), generator=generator), torch.randint(16, (n,), generator=generator)
-    taps = bilinear_taps(rows, columns, 4, (6, 4))
+    taps = bilinear_taps(rows, columns, 4, (6, 4), 16)
     axes = matrix_from_axis_angle(random(n, 3))
     turns = matrix_from_axis_angle(random(2, n, 3))
     blended = torch.cat([turns * 1.1, random(2, n, 3, 1)], -1)

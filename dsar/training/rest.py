@@ -1,0 +1,52 @@
+"""The garment at rest: the surface that the template learns, and how it hangs in each still frame.
+
+Cloth never comes to rest twice in the same folds. A template fitted to several still frames at once would
+blur what they differ in; so each of them has offsets of its own, and the template is what they share
+(extension).
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from dsar.avatar.avatar import Avatar, surface_links
+from dsar.config import LossConfig
+from dsar.network import NetworkOutput
+from dsar.training.losses import CENTIMETRES, spatial_loss
+
+PULL = 1e-4
+"""Weight of the squared offset, cm: what all frames share is the template's."""
+
+
+class RestShapes(nn.Module):
+    """Offsets of the garment in each still frame; empty where there is no garment."""
+
+    def __init__(self, avatar: Avatar, frames: list[tuple[str, int]]) -> None:
+        super().__init__()
+        self.frames = frames
+        """Sequence and frame of each shape."""
+        self.offsets = nn.Parameter(torch.zeros(len(frames), len(avatar.garment_points()), 3))
+        """Offsets of the garment's control points along their axes, metres."""
+
+    def output(self, avatar: Avatar, index: int) -> NetworkOutput:
+        """Return the output that gives the garment the shape it has in one of the frames."""
+        return avatar.offset_garment(self.offsets[[index]])
+
+    def first(self, sequence: str) -> Float[Tensor, "g 3"]:
+        """Return the offsets in the earliest still frame of a sequence, zeros if it has none."""
+        frames = [(frame, index) for index, (name, frame) in enumerate(self.frames) if name == sequence]
+        if not frames:
+            return torch.zeros_like(self.offsets[0])
+        return self.offsets[min(frames)[1]].detach().clone()
+
+    def loss(self, avatar: Avatar, config: LossConfig) -> Float[Tensor, ""]:
+        """Return what keeps the cloth in one piece: neighbours move together, in the template and off it."""
+        garment = avatar.garment_texels()
+        if not len(garment):
+            return self.offsets.new_zeros(())
+        chart = avatar.texel_positions[garment]
+        links = surface_links(avatar.texels[garment], avatar.atlas_size, chart)
+        moved = (avatar.template.means[garment] - chart)[None]
+        together = spatial_loss(avatar.at_points(avatar.offset_garment(self.offsets).offset), avatar.links)
+        pull = (self.offsets * CENTIMETRES).square().sum(-1).mean()
+        return config.shape * spatial_loss(moved, links) + config.spatial * together + PULL * pull
