@@ -58,6 +58,9 @@ class ModelConfig:
     lags: tuple[float, ...] = (0.1, 0.2, 0.4)
     """Feed, for each of these times in seconds, how far a running mean of the motion lags behind it
     (extension): a memory that nothing has to learn."""
+    pose_components: int = 0
+    """New poses are replaced by what so many principal components of the training poses say
+    of them, each within two standard deviations (Li et al. 2024); 0: they are taken as they are."""
     motion_embedding: bool = True
     """Add the embedding of the motion magnitude to the deepest features."""
     channels: tuple[int, ...] = (16, 32, 64)
@@ -228,10 +231,11 @@ class TrainConfig:
             raise ConfigError(
                 f"model.channels ends in {model.channels[-1]}, not a multiple of {model.heads} heads"
             )
-        if model.window < 1 or min(model.memory, model.feedback, model.bases) < 0:
+        if model.window < 1 or min(model.memory, model.feedback, model.bases, model.pose_components) < 0:
             raise ConfigError(
                 f"model.window is {model.window} (>= 1), model.memory {model.memory}, model.feedback "
-                f"{model.feedback} and model.bases {model.bases} (>= 0)"
+                f"{model.feedback}, model.bases {model.bases} and model.pose_components "
+                f"{model.pose_components} (>= 0)"
             )
         if not model.causal and model.readout == "last":
             raise ConfigError(

@@ -23,6 +23,8 @@ from dsar.network.maps import FrameMaps, maps_from_points
 from dsar.types import Capture, Gaussians, Motion
 
 _log = logging.getLogger(__name__)
+_FAMILIAR = 2.0
+"""Standard deviations of a principal component that a pose may be away from the mean of training."""
 GARMENT_FRAMES = 12
 """Still frames whose masks shape the garment chart."""
 
@@ -47,6 +49,9 @@ class Avatar(nn.Module):
     map_mean: Tensor
     map_scale: Tensor
     speed_scale: Tensor
+    pose_mean: Tensor
+    pose_basis: Tensor
+    pose_deviation: Tensor
     links: Tensor
     body_joints: Tensor
     tap_cells: Tensor
@@ -87,6 +92,9 @@ class Avatar(nn.Module):
         self.register_buffer("map_mean", torch.zeros(model.map_channels, 1, 1))
         self.register_buffer("map_scale", torch.ones(model.map_channels, 1, 1))
         self.register_buffer("speed_scale", torch.ones(()))
+        self.register_buffer("pose_mean", torch.zeros(3 * len(cells)))
+        self.register_buffer("pose_basis", torch.zeros(model.pose_components, 3 * len(cells)))
+        self.register_buffer("pose_deviation", torch.zeros(model.pose_components))
         occupied = torch.zeros(size[0] * size[1], dtype=torch.bool)
         occupied[cells] = True
         self.template = GaussianParameters(atlas.positions, atlas.tangents, atlas.hidden, model.sh_degree)
@@ -180,6 +188,13 @@ class Avatar(nn.Module):
         deviation = (values - self.map_mean[:, 0]).square().mean((0, 2)).sqrt()
         self.map_scale.copy_(deviation.clamp_min(1e-3)[:, None, None])
         self.speed_scale.copy_(torch.cat(speeds).square().mean().sqrt().clamp_min(1e-3))
+        if self.model.pose_components:
+            positions = values[:, :3].flatten(1)
+            self.pose_mean.copy_(positions.mean(0))
+            _, sizes, basis = torch.linalg.svd(positions - self.pose_mean, full_matrices=False)
+            count = min(len(sizes), self.model.pose_components)
+            self.pose_basis[:count] = basis[:count]
+            self.pose_deviation[:count] = sizes[:count] / len(positions) ** 0.5
 
     def garment_points(self) -> Int64[Tensor, " g"]:
         """Return which control points lie on the garment's chart; none where there is no such chart."""
@@ -221,8 +236,19 @@ class Avatar(nn.Module):
 
     def standardized(self, observed: FrameMaps) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 1 h w"]]:
         """Return input maps and motion magnitude as the network takes them."""
-        maps = (observed.maps - self.map_mean) / self.map_scale * self.network.occupied
+        maps = observed.maps
+        if self.model.pose_components and not self.training:
+            maps = torch.cat([self.familiar(maps[:, :3]), maps[:, 3:]], 1)
+        maps = (maps - self.map_mean) / self.map_scale * self.network.occupied
         return maps, observed.speed / self.speed_scale
+
+    def familiar(self, position: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
+        """Return the nearest position maps that the principal components of the training poses allow."""
+        flat = position.flatten(2)
+        parts = (flat[:, :, self.cells].flatten(1) - self.pose_mean) @ self.pose_basis.mT
+        bound = _FAMILIAR * self.pose_deviation
+        points = self.pose_mean + torch.clamp(parts, -bound, bound) @ self.pose_basis
+        return flat.index_copy(2, self.cells, points.unflatten(1, (3, -1))).view_as(position)
 
     def advance(
         self,

@@ -2,13 +2,17 @@
 
 import statistics
 
+import numpy as np
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
+from PIL import Image, ImageDraw
 from torch import Tensor
 
 from dsar.avatar.avatar import Avatar
 from dsar.avatar.rollout import roll_out, template_sequence
 from dsar.data.native import NativeCapture
+from dsar.geometry.cameras import project
+from dsar.types import Camera
 
 CLOSE = 0.02
 """Metres within which a point counts as right in the F-score."""
@@ -88,6 +92,19 @@ def measure_jitter(points: Float[Tensor, "f p 3"], fps: float) -> float:
     """Return the mean jerk of moving points, m/s³; 0 of fewer than four frames."""
     jerks = points.diff(n=3, dim=0).norm(dim=-1) * fps**3
     return float(jerks.mean()) if len(jerks) else 0.0
+
+
+def garment_mask(
+    vertices: Float[Tensor, "v 3"], faces: Int64[Tensor, "f 3"], camera: Camera
+) -> Bool[Tensor, "h w"]:
+    """Return where a mesh in world metres is in an image, whatever is in front of it."""
+    pixels = project(camera, vertices)[0]
+    picture = Image.new("1", (camera.width, camera.height))
+    draw = ImageDraw.Draw(picture)
+    # Pillow names a pixel after its centre, the project after its corner.
+    for triangle in (pixels[faces] - 0.5).tolist():
+        draw.polygon([tuple(corner) for corner in triangle], fill=1)
+    return torch.from_numpy(np.array(picture))
 
 
 @torch.no_grad()

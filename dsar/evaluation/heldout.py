@@ -17,8 +17,9 @@ from torch import Tensor
 from dsar.avatar.avatar import Avatar
 from dsar.avatar.rollout import START_FRAME, roll_out
 from dsar.data.native import NativeCapture
+from dsar.evaluation.divergence import median_distance, mmd, pose_features
 from dsar.evaluation.films import FILM_METRICS, evaluate_films
-from dsar.evaluation.garment import measure_garment
+from dsar.evaluation.garment import garment_mask, measure_garment
 from dsar.evaluation.metrics import ImageMetric, correlation, load_perceptual, psnr
 from dsar.evaluation.parts import read_clock, time_parts
 from dsar.evaluation.temporal import temporal_psnr, trace_back, warp_error
@@ -30,7 +31,16 @@ from dsar.training.losses import ssim
 from dsar.training.targets import mask_box
 from dsar.types import Camera, Capture, Gaussians
 
-_IMAGE_METRICS = ("psnr", "psnr_box", "psnr_box_template", "psnr_garment", "ssim", "lpips", "flip")
+_IMAGE_METRICS = (
+    "psnr",
+    "psnr_box",
+    "psnr_box_template",
+    "psnr_garment",
+    "ssim",
+    "lpips",
+    "lpips_vgg",
+    "flip",
+)
 METRICS = (*_IMAGE_METRICS, "tpsnr", "tlpips", "warp_error", "mmd")
 """What a split has a figure of, or null."""
 _SELDOM = 4
@@ -55,6 +65,7 @@ def evaluate_sequence(
     """
     motion = capture.motions[sequence]
     track = avatar.track(motion)
+    cloth = true_garment(capture, sequence)
     rows, before = [], None
     for number, gaussians in roll_out(avatar, motion, streams=streams):
         frame = number - START_FRAME
@@ -65,6 +76,9 @@ def evaluate_sequence(
                 image = render_white(gaussians, camera)
                 row: dict[str, float | int] = {"frame": frame, "camera": index}
                 row |= compare(image, render_white(template, camera), truth)
+                if cloth is not None:
+                    dressed = garment_mask(cloth[0][frame], cloth[1], camera) & (truth.mask > 0.5)
+                    row["psnr_garment"] = psnr(image[dressed][None], truth.color[dressed][None])
                 if frame % (_SELDOM * stride) == 0 and before is not None:
                     last = true_view(capture, sequence, frame - 1, index)
                     row |= compare_change((before, gaussians), camera, (last, truth), perceptual)
@@ -72,6 +86,13 @@ def evaluate_sequence(
                 rows.append(row)
         before = gaussians
     return rows
+
+
+def true_garment(capture: Capture, sequence: str) -> tuple[Tensor, Tensor] | None:
+    """Return the garment's true vertices [f,v,3] and triangles [t,3]; None where the capture has none."""
+    if not (isinstance(capture, NativeCapture) and capture.garment_runs(sequence)):
+        return None
+    return torch.from_numpy(capture.garment(sequence)), torch.from_numpy(capture.garment_faces(sequence))
 
 
 def compare(image: Tensor, template: Tensor, truth: View) -> dict[str, float]:
@@ -195,8 +216,12 @@ def evaluate(
     for split in ("train", "test", "nd", "fd"):
         names = [name for name in capture.splits.get(split, ()) if name in by_sequence]
         rows = summarize(by_sequence, names, len(capture.cameras)) if names else None
+        if rows:
+            rows["mmd"] = divergence(capture, names) if split != "train" else None
         splits[split] = rows and rows | dict.fromkeys(FILM_METRICS) | films.get(split, {})
     garments = {name: measure_garment(avatar, capture, name, 2 * stride) for name in capture.splits["test"]}
+    if not all(true_garment(capture, name) for name in by_sequence):
+        skipped["psnr_garment"] = "the capture does not say where the garment is"
     if not all(garments.values()):
         skipped["garment"] = "no simulated garment in the capture, or no garment chart in the avatar"
     milliseconds, slowest = time_rollout(avatar, capture, capture.splits["test"][0])
@@ -210,8 +235,17 @@ def evaluate(
         "one_to_many": one_to_many(avatar, capture, streams=streams),
         "garment": garments,
         "worst": worst_views(by_sequence, capture.splits["test"]),
-        "skipped": skipped | dict.fromkeys(("mmd", "psnr_garment"), "not measured by this version"),
+        "skipped": skipped,
     }
+
+
+def divergence(capture: Capture, names: Sequence[str]) -> float:
+    """Return how far the poses of some sequences are from those of training."""
+    known, new = (
+        torch.cat([pose_features(capture.motions[name]) for name in group])
+        for group in (capture.splits["train"], names)
+    )
+    return mmd(known, new, median_distance(known))
 
 
 def worst_views(

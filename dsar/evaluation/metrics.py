@@ -1,16 +1,20 @@
 """Image metrics, each on display-referred sRGB in [0, 1]."""
 
 import importlib.util
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import partial
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dsar.training.lpips import find_lpips_weights, load_lpips
+from dsar.training.lpips import Net, find_lpips_weights, load_lpips
 
 ImageMetric = Callable[[Float[Tensor, "h w 3"], Float[Tensor, "h w 3"]], float]
 """From an image and its truth."""
+
+
+_LPIPS: Mapping[str, Net] = {"lpips": "alex", "lpips_vgg": "vgg"}
 
 
 def psnr(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float:
@@ -41,21 +45,21 @@ def flip(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float:
     return float(flip_evaluator.evaluate(reference, test, "LDR", applyMagma=False)[1])
 
 
+@torch.no_grad()
+def _lpips(model: torch.nn.Module, image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float:
+    pair = (x.clamp(0, 1).movedim(-1, 0)[None].float().cpu() for x in (image, truth))
+    return float(model(*pair))
+
+
 def load_perceptual() -> tuple[dict[str, ImageMetric], dict[str, str]]:
     """Return the perceptual metrics that this installation can compute, and why it cannot compute others."""
     metrics: dict[str, ImageMetric] = {}
     skipped = {}
-    if find_lpips_weights("alex").exists():
-        model = load_lpips("alex")
-
-        @torch.no_grad()
-        def lpips(image: Tensor, truth: Tensor) -> float:
-            pair = (x.clamp(0, 1).movedim(-1, 0)[None].float().cpu() for x in (image, truth))
-            return float(model(*pair))
-
-        metrics["lpips"] = lpips
-    else:
-        skipped["lpips"] = "its weights are not on this machine: run tools/fetch_lpips.py"
+    for name, net in _LPIPS.items():
+        if find_lpips_weights(net).exists():
+            metrics[name] = partial(_lpips, load_lpips(net))
+        else:
+            skipped[name] = "its weights are not on this machine: run tools/fetch_lpips.py"
     if importlib.util.find_spec("flip_evaluator"):
         metrics["flip"] = flip
     else:

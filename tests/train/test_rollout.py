@@ -66,6 +66,30 @@ def test_turning_and_shifting_the_motion_turns_and_shifts_the_gaussians(avatar):
         assert torch.allclose(two.harmonics[:, 0], one.harmonics[:, 0], atol=2e-3)
 
 
+def test_unfamiliar_poses_become_familiar_ones_once_trained():
+    config = ModelConfig(channels=(8, 16), heads=2, pose_components=10)
+    avatar = Avatar(load_body(), Atlas.stack([body_chart(load_body(), 32)]), config, 30.0)
+    avatar.measure_maps([avatar.track(dance(60))])
+    flailing = dataclasses.replace(dance(60), rotations=3 * dance(60).rotations)
+
+    def standardized(motion: Motion) -> torch.Tensor:
+        return avatar.standardized(avatar.maps(avatar.track(motion)[:2], 30.0))[0]
+
+    raw, wild = standardized(dance(60)), standardized(flailing)
+    avatar.eval()
+    near, tame = standardized(dance(60)), standardized(flailing)
+    # Motion of many joints needs more than ten components, but not many more.
+    assert (near - raw)[:, :3].square().mean() < 0.02 * raw[:, :3].square().mean()
+    assert torch.equal(near[:, 3:], raw[:, 3:])
+    parts = avatar.maps(avatar.track(flailing)[:2], 30.0).maps[:, :3].flatten(2)[:, :, avatar.cells]
+    far = ((parts.flatten(1) - avatar.pose_mean) @ avatar.pose_basis.mT).abs() / avatar.pose_deviation
+    assert far.max() > 2
+    points = tame[:, :3].flatten(2)[:, :, avatar.cells] * avatar.map_scale[:3, 0] + avatar.map_mean[:3, 0]
+    found = ((points.flatten(1) - avatar.pose_mean) @ avatar.pose_basis.mT).abs() / avatar.pose_deviation
+    assert found.max() < 2.01
+    assert not torch.allclose(tame[:, :3], wild[:, :3], atol=0.1)
+
+
 def test_a_range_of_frames_has_the_same_history_as_the_whole(avatar):
     motion = dance(12)
     whole = dict(roll_out(avatar, motion))

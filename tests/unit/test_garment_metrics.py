@@ -8,11 +8,13 @@ import torch
 from dsar.evaluation.garment import (
     closest_on_triangles,
     distance_to_mesh,
+    garment_mask,
     hem_loop,
     measure_hem,
     measure_jitter,
     measure_shape,
 )
+from dsar.types import Camera
 
 
 def skirt(around: int = 60, rows: int = 20, top: float = 0.1, bottom: float = 0.3):
@@ -91,3 +93,18 @@ def test_jitter_is_the_jerk_of_a_path():
     assert measure_jitter(cubic, 24.0) == pytest.approx(12, rel=1e-6)
     assert measure_jitter(steady, 24.0) == pytest.approx(0, abs=1e-6)
     assert measure_jitter(steady[:3], 24.0) == 0
+
+
+def test_a_square_covers_the_pixels_that_the_camera_projects_it_to():
+    K = torch.tensor([[20.0, 0.0, 16.0], [0.0, 20.0, 12.0], [0.0, 0.0, 1.0]])
+    camera = Camera(K, torch.eye(4), 32, 24, "front")
+    # At 2 m a metre is ten pixels: from pixel 6 to 26 across and 7 to 17 down.
+    vertices = torch.tensor([[-1.0, -0.5, 2.0], [1.0, -0.5, 2.0], [1.0, 0.5, 2.0], [-1.0, 0.5, 2.0]])
+    mask = garment_mask(vertices, torch.tensor([[0, 1, 2], [0, 2, 3]]), camera)
+    expected = torch.zeros(24, 32, dtype=torch.bool)
+    expected[7:17, 6:26] = True
+    # Pillow fills the border too, half a pixel each way.
+    assert mask[expected].all()
+    grown = torch.zeros_like(expected)
+    grown[6:18, 5:27] = True
+    assert not mask[~grown].any()
