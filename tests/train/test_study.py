@@ -67,9 +67,11 @@ def test_a_study_goes_on_with_what_is_missing_and_does_nothing_twice(tiny_captur
     told.clear()
     assert study.run(tables, hours=0.0, report=lambda *what: told.append(what))
     assert told == [("done", 1.0)]
-    (tmp_path / "feedback=0,seed=0" / "figures.json").unlink()
-    with pytest.raises(ConfigError, match="other settings"):
+    with pytest.raises(ConfigError, match=r"full,seed=0/figures\.json is of a model with other settings"):
         Study(tmp_path, 0.1, str(tiny_capture)).run(tables)
+    (tmp_path / "feedback=0,seed=0" / "figures.json").unlink()
+    with pytest.raises(ConfigError, match="feedback=0,seed=0 is of a model with other settings"):
+        Study(tmp_path, 0.1, str(tiny_capture)).run([Table("less", (TINY["tiny"].rows[1],))])
 
     summary = summarize_tables(study, TINY)
     full, less, zeroed = summary["tiny"]["rows"]

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from dsar.config import PRESETS, TrainConfig, config_from_json
+from dsar.config import PRESETS, TrainConfig, config_to_json
 from dsar.data.capture import open_capture
 from dsar.errors import ConfigError
 from dsar.evaluation.heldout import evaluate
@@ -100,7 +100,7 @@ class Study:
         """
         began, needed = time.monotonic(), self.measurements(tables)
         for done, each in enumerate(needed):
-            if self._figures(each).exists():
+            if self._measured(each):
                 continue
             if not self._trained(each.model):
                 if hours is not None and time.monotonic() - began > 3600 * hours - 60 * self._expected:
@@ -131,21 +131,37 @@ class Study:
         suffix = "".join(f"-without-{stream}" for stream in each.zeroed)
         return self._run(each.model).folder / f"figures{suffix}.json"
 
+    def _measured(self, each: Measurement) -> bool:
+        path = self._figures(each)
+        if path.exists():
+            self._check(path, json.loads(path.read_text())["config"], each.model)
+        return path.exists()
+
     def _trained(self, model: Model) -> bool:
         run = self._run(model)
-        if run.exists and config_from_json(run.config) != self.config(model):
+        if run.exists:
+            self._check(run.folder, json.loads(run.config.read_text()), model)
+        return run.exists and read_progress(run)["progress"] >= 1
+
+    def _check(self, path: Path, settings: Any, model: Model) -> None:
+        if settings != json.loads(config_to_json(self.config(model))):
             raise ConfigError(
-                f"{run.folder} was trained with other settings than this study's ({self.minutes:g} minutes, "
+                f"{path} is of a model with other settings than this study's ({self.minutes:g} minutes, "
                 f"preset {self.preset}, this version's defaults); give the study another folder"
             )
-        return run.exists and read_progress(run)["progress"] >= 1
 
     def _measure(self, each: Measurement) -> None:
         model, run = each.model, self._run(each.model)
         avatar, config, provenance = load_checkpoint(run)
         capture = open_capture(config.capture)
         streams: list[Stream] = [stream for stream in STREAMS if stream not in each.zeroed]
-        found = {"settings": dict(model.settings), "seed": model.seed, "minutes": self.minutes, **provenance}
+        found = {
+            "config": json.loads(config_to_json(config)),
+            "settings": dict(model.settings),
+            "seed": model.seed,
+            "minutes": self.minutes,
+            **provenance,
+        }
         found |= {"updates": read_progress(run)["step"], **evaluate(avatar, capture, streams=streams)}
         if not each.zeroed:
             far = (capture.splits.get("fd") or capture.splits["test"])[0]
