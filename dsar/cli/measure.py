@@ -44,7 +44,8 @@ class Eval(Common):
     def run_study(self) -> None:
         """Train and measure what the tables lack; print them."""
         from dsar.evaluation.study import ABLATIONS, BASELINES, Study, summarize_tables, to_markdown
-        from dsar.evaluation.study.chart import draw_chart, points_of
+        from dsar.evaluation.study.chart import draw_chart, points_of, times_of
+        from dsar.training.checkpoint import write_whole
 
         self.check_device()
         tables = (ABLATIONS if self.ablations else {}) | (BASELINES if self.baselines else {})
@@ -52,13 +53,15 @@ class Eval(Common):
         with Bar(self.progress, "study").running() as bar:
             complete = study.run(list(tables.values()), self.hours, lambda what, share: bar.show(share, what))
         summary = summarize_tables(study, tables)
-        self.write_json({"complete": complete, "minutes": self.minutes, "tables": summary})
+        found = {"complete": complete, "minutes": self.minutes, "tables": summary}
+        self.write_json(found)
+        write_whole(self.study / "study.json", json.dumps(found, indent=1) + "\n")
         sys.stdout.write(to_markdown(summary))
         if not complete:
             sys.stdout.write("\nNot complete: the same command goes on with what is missing.\n")
         points = points_of(summary)
         if self.chart is not None and points:
-            draw_chart(points, self.chart)
+            draw_chart(points, times_of(summary), self.chart)
 
     def run_heldout(self) -> None:
         """Measure one run."""

@@ -16,6 +16,8 @@ from jinja2 import Environment, StrictUndefined
 from plotly.offline import get_plotlyjs
 
 from dsar.config import PRESETS, TrainConfig, config_from_json, config_to_json
+from dsar.evaluation.study.chart import QUALITIES, interactive_chart, points_of, times_of
+from dsar.evaluation.study.summary import table_cells
 from dsar.training.checkpoint import Run, read_progress, write_whole
 
 _STAGES = {"template": "#9aa5b1", "imitation": "#c77d0a", "pose": "#4c78a8", "autoregressive": "#2a7f62"}
@@ -31,10 +33,10 @@ def write_report(run: Run) -> Path:
     """Write report.html from what lies in a run's folder; what was not measured yet is said to be so.
 
     That is config.json, metrics.jsonl, the checkpoint, previews, and the figures that `dsar eval` and
-    `dsar stress` leave (figures.json, stress.json).
+    `dsar stress` leave (figures.json, stress.json), and the tables of a study beside it.
     """
     config, lines = config_from_json(run.config), _lines(run)
-    figures, battery = map(_read, (run.figures, run.stress))
+    figures, battery, study = map(_read, (run.figures, run.stress, run.study))
     splits = {name: values for name, values in (figures or {}).get("splits", {}).items() if values}
     metrics = [key for key in _METRICS if any(values.get(key) is not None for values in splits.values())]
     facts = {
@@ -52,8 +54,13 @@ def write_report(run: Run) -> Path:
         "splits": [(name, *(values.get(key) for key in metrics)) for name, values in splits.items()],
         "battery": battery,
         "stability": _draw_stability(battery) if battery else "",
+        "study": study,
+        "charts": list(_draw_study(study["tables"], figures)) if study else [],
         "curves": list(_draw_curves(lines)),
         "environment": _environment(),
+        "tables": [(table["title"], *table_cells(table)) for table in study["tables"].values()]
+        if study
+        else [],
         "rows": lambda garment: [(who, *values.values()) for who, values in garment.items()],
     }
     engine = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
@@ -85,6 +92,26 @@ def _draw_stability(battery: Mapping[str, Any]) -> str:
         shown = True if case == "stop" else "legendonly"
         figure.add_scatter(y=verdict["curve"], name=f"{case}, {verdict['unit']}", visible=shown)
     return _draw(figure, "round, cycle or frame", "the case's own measure", log=True)
+
+
+def _draw_study(summary: Mapping[str, Any], figures: Mapping[str, Any] | None) -> Iterator[str]:
+    """Return the study's models, speed against accuracy, and this run among them once it is measured."""
+    for quality in QUALITIES:
+        figure = interactive_chart(points_of(summary), quality)
+        if figures is not None:
+            far = figures["splits"]["fd"] or figures["splits"]["test"]
+            place = {"x": [1000 / figures["fps"]], "y": [far[quality]]}
+            figure.add_scatter(
+                **place, mode="markers", marker={"symbol": "star", "size": 16}, name="this run"
+            )
+        figure.update_xaxes(type="log")
+        yield _draw(figure, "milliseconds a frame", quality, log=False)
+    figure = go.Figure()
+    for label, line in times_of(summary).items():
+        minutes, psnr = zip(*line, strict=True)
+        figure.add_scatter(x=minutes, y=psnr, name=label)
+    if figure.data:
+        yield _draw(figure, "minutes of training", "psnr_box", log=False)
 
 
 def _draw_curves(lines: list[dict[str, Any]]) -> Iterator[str]:

@@ -62,6 +62,12 @@ class Run:
         return self.folder / "stress.json"
 
     @property
+    def study(self) -> Path:
+        """The tables of the models beside it, where `dsar eval` made some (`runs/study/study.json`)."""
+        own, near = self.folder.parent / "study.json", self.folder.parent / "study" / "study.json"
+        return own if own.exists() else near
+
+    @property
     def report(self) -> Path:
         """The page that shows all of it."""
         return self.folder / "report.html"

@@ -5,6 +5,7 @@ import json
 import pytest
 
 from dsar.errors import ConfigError
+from dsar.evaluation.report import write_report
 from dsar.evaluation.stress import run_causal
 from dsar.evaluation.study import (
     ABLATIONS,
@@ -16,6 +17,7 @@ from dsar.evaluation.study import (
     summarize_tables,
     to_markdown,
 )
+from dsar.training.checkpoint import Run, write_whole
 
 TINY = {
     "tiny": Table(
@@ -74,6 +76,11 @@ def test_a_study_goes_on_with_what_is_missing_and_does_nothing_twice(tiny_captur
         Study(tmp_path, 0.1, str(tiny_capture)).run([Table("less", (TINY["tiny"].rows[1],))])
 
     summary = summarize_tables(study, TINY)
+    run = Run(tmp_path / "full,seed=0")
+    write_whole(run.study, json.dumps({"complete": False, "minutes": 0.05, "tables": summary}))
+    page = write_report(run).read_text()
+    for text in ("Beside other models", "not complete yet", "no feedback", "this run"):
+        assert text in page
     full, less, zeroed = summary["tiny"]["rows"]
     assert full["seeds"] == zeroed["seeds"] == [0]
     assert less["seeds"] == []

@@ -4,7 +4,14 @@ from xml.etree import ElementTree
 
 import pytest
 
-from dsar.evaluation.study.chart import Point, draw_chart, pareto_front, points_of
+from dsar.evaluation.study.chart import (
+    Point,
+    draw_chart,
+    interactive_chart,
+    pareto_front,
+    points_of,
+    times_of,
+)
 
 POINTS = [
     Point("quick", 2.0, 20.0, 0.06, 1000.0, 1.0),
@@ -24,11 +31,25 @@ def test_the_front_holds_who_is_beaten_by_nobody():
 
 
 def test_zeroed_and_missing_rows_are_no_models():
-    mean = {"fps": 50.0, "psnr_box": 21.0, "lpips": None, "gaussians": 100.0, "passed": 1.0}
+    mean = {"fps": 50.0, "psnr_box": 21.0, "lpips": None, "gaussians": 100.0, "passed": 1.0, "minutes": 5.0}
     row = {"label": "full", "settings": {}, "zeroed": [], "mean": mean}
     rows = [row, row | {"label": "again"}, row | {"zeroed": ["state"], "settings": {"a": 1}}]
     rows.append(row | {"settings": {"b": 1}, "mean": dict.fromkeys(mean)})
-    assert points_of({"table": {"rows": rows}}) == [Point("full", 20.0, 21.0, None, 100.0, 1.0)]
+    longer = row | {
+        "settings": {"schedule.minutes": 20.0},
+        "mean": mean | {"psnr_box": 22.0, "minutes": 20.0},
+    }
+    summary = {"table": {"rows": rows}, "time": {"rows": [longer]}}
+    assert points_of(summary) == [Point("full", 20.0, 21.0, None, 100.0, 1.0)]
+    assert times_of(summary) == {"full": [(5.0, 21.0), (20.0, 22.0)]}
+
+
+def test_the_interactive_chart_names_who_was_measured():
+    front, models = interactive_chart(POINTS, "lpips").data
+    assert list(front.y) == [0.06, 0.03]
+    assert [text.partition(":")[0] for text in models.text] == [
+        p.label for p in POINTS if p.lpips is not None
+    ]
 
 
 def test_the_picture_names_every_model(tmp_path):
@@ -36,6 +57,6 @@ def test_the_picture_names_every_model(tmp_path):
     from matplotlib import rc_context
 
     with rc_context({"svg.fonttype": "none"}):
-        path = draw_chart(POINTS, tmp_path / "new" / "chart.svg")
+        path = draw_chart(POINTS, {"quick": [(5.0, 20.0), (10.0, 20.5)]}, tmp_path / "new" / "chart.svg")
     words = {element.text for element in ElementTree.parse(path).iter() if element.text}
     assert {point.label for point in POINTS} <= words

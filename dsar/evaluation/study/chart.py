@@ -15,7 +15,9 @@ PAPER = {
 }
 """Frames a second on an RTX 4090 at 940x1280, PSNR and LPIPS, as published (tables 1 and supplementary 2)."""
 Quality = Literal["psnr_box", "lpips"]
+QUALITIES: tuple[Quality, ...] = ("psnr_box", "lpips")
 _LABELS: Mapping[Quality, str] = {"psnr_box": "PSNR, dB (ours: in the mask's box)", "lpips": "LPIPS"}
+_TIME = "schedule.minutes"
 _AREA = 200
 """Points² of the marker of the model with most Gaussians."""
 
@@ -38,17 +40,34 @@ class Point:
 
 
 def points_of(summary: Mapping[str, Any]) -> list[Point]:
-    """Return the models of a study's summary that were measured whole, each once."""
+    """Return the models of a study's summary that were measured whole and trained as long, each once."""
     found: dict[str, Point] = {}
-    for table in summary.values():
-        for row in table["rows"]:
-            mean = row["mean"]
-            if not row["zeroed"] and mean["fps"]:
-                values = (1000 / mean["fps"], mean["psnr_box"], mean["lpips"], mean["gaussians"])
-                found.setdefault(
-                    str(sorted(row["settings"].items())), Point(row["label"], *values, mean["passed"])
-                )
+    for row in _rows(summary):
+        mean = row["mean"]
+        if _TIME not in row["settings"]:
+            values = (1000 / mean["fps"], mean["psnr_box"], mean["lpips"], mean["gaussians"])
+            found.setdefault(_key(row["settings"]), Point(row["label"], *values, mean["passed"]))
     return list(found.values())
+
+
+def times_of(summary: Mapping[str, Any]) -> dict[str, list[tuple[float, float]]]:
+    """Return minutes of training and PSNR in the box of each model that was trained for several times."""
+    found: dict[str, dict[float, float]] = {}
+    labels: dict[str, str] = {}
+    for row in _rows(summary):
+        rest = {key: value for key, value in row["settings"].items() if key != _TIME}
+        found.setdefault(_key(rest), {})[row["mean"]["minutes"]] = row["mean"]["psnr_box"]
+        labels.setdefault(_key(rest), row["label"])
+    return {labels[key]: sorted(times.items()) for key, times in found.items() if len(times) > 1}
+
+
+def _rows(summary: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    rows = [row for table in summary.values() for row in table["rows"]]
+    return [row for row in rows if not row["zeroed"] and row["mean"]["fps"]]
+
+
+def _key(settings: Mapping[str, Any]) -> str:
+    return str(sorted(settings.items()))
 
 
 def pareto_front(points: Sequence[Point], quality: Quality) -> list[Point]:
@@ -62,13 +81,17 @@ def pareto_front(points: Sequence[Point], quality: Quality) -> list[Point]:
     return front
 
 
-def draw_chart(points: Sequence[Point], path: Path) -> Path:
+def draw_chart(
+    points: Sequence[Point], times: Mapping[str, Sequence[tuple[float, float]]], path: Path
+) -> Path:
     """Draw time against PSNR and against LPIPS, and the paper's published figures on panels of their own.
 
-    Area: Gaussians. Colour: share of the stability battery that is passed. Line: the Pareto front.
+    Area: Gaussians. Colour: share of the stability battery that is passed. Line: the Pareto front. A fifth
+    panel shows what longer training brings.
 
     Args:
         points: The models.
+        times: Minutes of training and PSNR by model, from `times_of`.
         path: .svg, .png or any other format that matplotlib writes.
 
     Raises:
@@ -78,8 +101,10 @@ def draw_chart(points: Sequence[Point], path: Path) -> Path:
         from matplotlib.figure import Figure
     except ImportError as error:
         raise MissingDependencyError("the chart", "matplotlib", "eval") from error
-    figure = Figure(figsize=(13, 9), layout="constrained")
-    panels = figure.subplots(2, 2)
+    figure = Figure(figsize=(20, 9), layout="constrained")
+    panels = figure.subplots(2, 3)
+    panels[1][2].remove()
+    _draw_times(panels[0][2], times)
     for column, quality in enumerate(_LABELS):
         drawn = _draw_models(panels[0][column], points, quality)
         _draw_published(panels[1][column], column + 1, quality)
@@ -114,6 +139,43 @@ def _draw_models(axes: Any, points: Sequence[Point], quality: Quality) -> Any:
     axes.plot(*line, "--", color="grey", linewidth=1)
     _label(axes, "milliseconds a frame, on this machine", quality)
     return drawn
+
+
+def _draw_times(axes: Any, times: Mapping[str, Sequence[tuple[float, float]]]) -> None:
+    for label, line in times.items():
+        axes.plot(*zip(*line, strict=True), "o-", label=label)
+    axes.set(xlabel="minutes of training, on this machine", ylabel=_LABELS["psnr_box"])
+    if times:
+        axes.legend()
+
+
+def interactive_chart(points: Sequence[Point], quality: Quality) -> Any:
+    """Return the same panel of time against a quality as a plotly figure that names its points."""
+    import plotly.graph_objects as go
+
+    shown = [point for point in points if getattr(point, quality) is not None]
+    largest = max((point.gaussians for point in shown), default=1.0)
+    figure, front = go.Figure(), pareto_front(points, quality)
+    place = [point.ms for point in front], [getattr(point, quality) for point in front]
+    figure.add_scatter(
+        x=place[0], y=place[1], mode="lines", line={"dash": "dash", "color": "grey"}, name="front"
+    )
+    figure.add_scatter(
+        x=[point.ms for point in shown],
+        y=[getattr(point, quality) for point in shown],
+        mode="markers",
+        text=[f"{point.label}: {point.gaussians:.0f} Gaussians" for point in shown],
+        marker={
+            "size": [24 * (point.gaussians / largest) ** 0.5 for point in shown],
+            "color": [point.passed or 0.0 for point in shown],
+            "cmin": 0,
+            "cmax": 1,
+            "colorscale": "RdYlGn",
+            "colorbar": {"title": "stability"},
+        },
+        name="models",
+    )
+    return figure
 
 
 def _draw_published(axes: Any, column: int, quality: Quality) -> None:

@@ -20,7 +20,7 @@ from dsar.training.checkpoint import Run, load_checkpoint, read_progress, write_
 from dsar.training.loop import train
 from dsar.training.report import Report
 
-_MEASURING = 5
+_MEASURING = 2
 """Minutes that measuring a model takes on two cores, about."""
 _ENOUGH = 1_000_000
 """Updates that no budget of minutes reaches."""
@@ -67,7 +67,7 @@ class Study:
         """Return what the tables need, first seeds first."""
         rows = [row for table in tables for row in table.rows]
         wanted = [
-            Measurement(Model(row.settings, seed), row.zeroed) for row in rows for seed in range(row.seeds)
+            Measurement(self._model(row, seed), row.zeroed) for row in rows for seed in range(row.seeds)
         ]
         unique = {self._figures(each): each for each in wanted}.values()
         return sorted(unique, key=lambda each: each.model.seed)
@@ -103,7 +103,9 @@ class Study:
             if self._measured(each):
                 continue
             if not self._trained(each.model):
-                if hours is not None and time.monotonic() - began > 3600 * hours - 60 * self._expected:
+                if hours is not None and time.monotonic() - began > 3600 * hours - 60 * self._expected(
+                    each.model
+                ):
                     return False
                 run, what = self._run(each.model), f"train {each.model.name}"
                 follow = partial(_follow, report, what, done, len(needed))
@@ -115,14 +117,18 @@ class Study:
 
     def figures(self, row: Row) -> list[dict[str, Any]]:
         """Return what was found of a row, a dictionary a seed; seeds that are missing are left out."""
-        each = (Measurement(Model(row.settings, seed), row.zeroed) for seed in range(row.seeds))
+        each = (Measurement(self._model(row, seed), row.zeroed) for seed in range(row.seeds))
         paths = [self._figures(one) for one in each]
         return [json.loads(path.read_text()) for path in paths if path.exists()]
 
-    @property
-    def _expected(self) -> float:
-        """Minutes that a model takes."""
-        return self.minutes + _MEASURING
+    def _model(self, row: Row, seed: int) -> Model:
+        # A row of the study's own length is the same model as one that names no length.
+        same = {"schedule.minutes": self.minutes}
+        return Model({k: v for k, v in row.settings.items() if same.get(k) != v}, seed)
+
+    def _expected(self, model: Model) -> float:
+        """Return the minutes that a model takes."""
+        return (self.config(model).schedule.minutes or self.minutes) + _MEASURING
 
     def _run(self, model: Model) -> Run:
         return Run(self.folder / model.name)

@@ -7,9 +7,18 @@ from typing import Any
 from dsar.evaluation.study.runner import Study
 from dsar.evaluation.study.tables import Row, Table
 
-_IMAGE = ("psnr", "psnr_box", "ssim", "lpips", "flip", "tpsnr", "vmaf")
-_COLUMNS = (*_IMAGE, "correlation", "fps", "gaussians", "passed", "updates")
-_DIGITS = {"ssim": 4, "lpips": 4, "flip": 4, "fps": 0, "gaussians": 0, "updates": 0}
+_IMAGE = ("psnr", "psnr_box", "psnr_garment", "ssim", "lpips", "lpips_vgg", "flip", "tpsnr", "vmaf")
+_COLUMNS = (*_IMAGE, "correlation", "fps", "gaussians", "passed", "updates", "minutes")
+_DIGITS = {
+    "ssim": 4,
+    "lpips": 4,
+    "lpips_vgg": 4,
+    "flip": 4,
+    "fps": 0,
+    "gaussians": 0,
+    "updates": 0,
+    "minutes": 1,
+}
 
 
 def summarize_tables(study: Study, tables: Mapping[str, Table]) -> dict[str, Any]:
@@ -49,6 +58,7 @@ def _numbers(figures: Mapping[str, Any], split: str) -> dict[str, float | None]:
         "gaussians": figures["gaussians"],
         "passed": None if battery is None else sum(c["pass"] for c in battery.values()) / len(battery),
         "updates": figures["updates"],
+        "minutes": figures["config"]["schedule"]["minutes"],
     }
 
 
@@ -56,15 +66,21 @@ def to_markdown(summary: Mapping[str, Any]) -> str:
     """Return the tables as Markdown: ours with the spread over seeds, and the paper's beside them."""
     parts = []
     for table in summary.values():
-        paper = [key for key in _IMAGE if any(key in row["paper"] for row in table["rows"])]
-        head = ["", "seeds", *_COLUMNS, *(f"paper {key}" for key in paper)]
-        lines = [f"### {table['title']}", "", _line(head), _line(["---"] * len(head))]
-        for row in table["rows"]:
-            cells = [_cell(row["mean"][key], row["spread"][key], _DIGITS.get(key, 2)) for key in _COLUMNS]
-            theirs = [_cell(row["paper"].get(key), None, _DIGITS.get(key, 2)) for key in paper]
-            lines.append(_line([row["label"], str(len(row["seeds"])), *cells, *theirs]))
-        parts.append("\n".join(lines))
+        head, rows = table_cells(table)
+        lines = [_line(cells) for cells in (head, ["---"] * len(head), *rows)]
+        parts.append("\n".join([f"### {table['title']}", "", *lines]))
     return "\n\n".join(parts) + "\n"
+
+
+def table_cells(table: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
+    """Return a table's head and rows as text; the paper's figures stand in the last columns."""
+    paper = [key for key in _IMAGE if any(key in row["paper"] for row in table["rows"])]
+    head, rows = ["", "seeds", *_COLUMNS, *(f"paper {key}" for key in paper)], []
+    for row in table["rows"]:
+        cells = [_cell(row["mean"][key], row["spread"][key], _DIGITS.get(key, 2)) for key in _COLUMNS]
+        theirs = [_cell(row["paper"].get(key), None, _DIGITS.get(key, 2)) for key in paper]
+        rows.append([row["label"], str(len(row["seeds"])), *cells, *theirs])
+    return head, rows
 
 
 def _cell(value: float | None, spread: float | None, digits: int) -> str:

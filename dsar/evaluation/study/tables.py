@@ -183,6 +183,15 @@ ABLATIONS: dict[str, Table] = {
     ),
 }
 
+ABLATIONS["time"] = Table(
+    "Training time",
+    tuple(
+        Row(f"{label}, {minutes:g} minutes", {**settings, "schedule.minutes": minutes})
+        for minutes in (2.5, 10.0, 20.0)
+        for label, settings in (("full model", {}), ("pose only", _POSE_ONLY))
+    ),
+)
+
 BASELINES: dict[str, Table] = {
     "baselines": Table(
         "Paradigms of other systems, in our code (not their authors')",
