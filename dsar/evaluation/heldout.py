@@ -44,6 +44,8 @@ _IMAGE_METRICS = (
 METRICS = (*_IMAGE_METRICS, "tpsnr", "tlpips", "warp_error", "mmd")
 """What a split has a figure of, or null."""
 _SELDOM = 4
+_RARE = {"lpips_vgg": 16}
+"""Metrics that take a fifth of a second a view."""
 _WARM_UP = 10
 _MOMENT = 15
 """Frames that look alike."""
@@ -61,7 +63,8 @@ def evaluate_sequence(
 ) -> list[dict[str, float | int]]:
     """Return the metrics of every view of every `stride`-th frame of one sequence.
 
-    Of every 4th of them also those that take long: the `perceptual` ones, and those of two frames.
+    Of every 4th of them also those that take long: the `perceptual` ones, and those of two frames; of every
+    16th those that take longest.
     """
     motion = capture.motions[sequence]
     track = avatar.track(motion)
@@ -82,7 +85,8 @@ def evaluate_sequence(
                 if frame % (_SELDOM * stride) == 0 and before is not None:
                     last = true_view(capture, sequence, frame - 1, index)
                     row |= compare_change((before, gaussians), camera, (last, truth), perceptual)
-                    row |= {name: metric(image, truth.color) for name, metric in perceptual.items()}
+                    due = [name for name in perceptual if frame % (_RARE.get(name, 1) * stride) == 0]
+                    row |= {name: perceptual[name](image, truth.color) for name in due}
                 rows.append(row)
         before = gaussians
     return rows
@@ -203,8 +207,16 @@ def evaluate(
     perceptual, skipped = load_perceptual()
     strides = dict.fromkeys(capture.splits["train"], 8 * stride)
     strides |= dict.fromkeys(capture.splits["test"], stride)
+    quick = {name: metric for name, metric in perceptual.items() if name not in _RARE}
     by_sequence = {
-        name: evaluate_sequence(avatar, capture, name, each, streams=streams, perceptual=perceptual)
+        name: evaluate_sequence(
+            avatar,
+            capture,
+            name,
+            each,
+            streams=streams,
+            perceptual=quick if name in capture.splits["train"] else perceptual,
+        )
         for name, each in strides.items()
     }
     if "lpips" in skipped:
