@@ -17,7 +17,6 @@ from torch import Tensor
 from dsar.avatar.avatar import Avatar, blend
 from dsar.config import ScheduleConfig, TrainConfig
 from dsar.geometry.cameras import project
-from dsar.network import NetworkOutput
 from dsar.raster import rasterize, reduced_dilation
 from dsar.training import workers
 from dsar.training.losses import image_loss, spatial_loss
@@ -79,7 +78,7 @@ class Registration:
         """Frames fitted by the busiest worker."""
         self.used = 0.0
         """Share of the budget of time that was used."""
-        self.maps = {name: torch.zeros(len(tracks[name]), 3, *avatar.grid_size) for name in wanted}
+        self.offsets = {name: torch.zeros(len(tracks[name]), len(avatar.cells), 3) for name in wanted}
         self.fitted = {name: torch.zeros((), dtype=torch.int64) for name in wanted}
 
     @property
@@ -88,10 +87,10 @@ class Registration:
         return self.count >= self.longest or self.used >= LIMIT
 
     @property
-    def result(self) -> dict[str, tuple[range, Float[Tensor, "_ 3 h w"]]]:
-        """The frames of each sequence that have a map, and its maps."""
+    def result(self) -> dict[str, tuple[range, Float[Tensor, "_ p 3"]]]:
+        """The frames of each sequence that have a map, and the maps at the control points, metres."""
         frames = {name: range(start, start + int(self.fitted[name])) for name, start in self.starts.items()}
-        return {name: (frames[name], maps) for name, maps in self.maps.items() if frames[name]}
+        return {name: (frames[name], maps) for name, maps in self.offsets.items() if frames[name]}
 
     @property
     def haste(self) -> float:
@@ -101,23 +100,23 @@ class Registration:
 
     def reduced(self, schedule: ScheduleConfig) -> ScheduleConfig:
         """Return the schedule, without imitation where there is no garment to imitate."""
-        return schedule if self.maps else dataclasses.replace(schedule, imitation_share=0.0)
+        return schedule if self.offsets else dataclasses.replace(schedule, imitation_share=0.0)
 
     def share(self) -> None:
         """Give all workers what each has fitted."""
-        workers.add_up([*self.maps.values(), *self.fitted.values()])
+        workers.add_up([*self.offsets.values(), *self.fitted.values()])
         self.count, self.places = self.longest, []
 
     def carried(self) -> dict[str, Tensor]:
         """Return what must survive a restart."""
-        tensors = {f"map.{name}": maps for name, maps in self.maps.items()}
+        tensors = {f"offsets.{name}": maps for name, maps in self.offsets.items()}
         tensors |= {f"fitted.{name}": fitted for name, fitted in self.fitted.items()}
         tensors["rest"] = self.rest.offsets.detach()
         return tensors | {"count": torch.tensor(self.count), "used": torch.tensor(self.used)}
 
     def carry_on(self, tensors: Mapping[str, Tensor]) -> None:
         """Restore what `carried` returned."""
-        self.maps = {name: tensors[f"map.{name}"] for name in self.maps}
+        self.offsets = {name: tensors[f"offsets.{name}"] for name in self.offsets}
         self.fitted = {name: tensors[f"fitted.{name}"] for name in self.fitted}
         with torch.no_grad():
             self.rest.offsets.copy_(tensors["rest"])
@@ -134,7 +133,7 @@ class Registration:
         rng = np.random.default_rng([self.seed, self.order.index(name), frame])
         context = self.tracks[name][[frame]]
         guesses, fast = self._guesses(context, name, frame)
-        points = self._posed(context, self._map(guesses[0]))
+        points = self._posed(context, guesses[0])
         view = functools.cache(functools.partial(self._view, name, frame, points=points))
         cameras = len(self.capture.cameras)
 
@@ -149,10 +148,10 @@ class Registration:
         for _ in range(STEPS):
             optimizer.zero_grad()
             loss, mse = self._compare(context, offset, some_views(), rng.random(3))
-            loss = loss + JOLT * self._roughness(self._map(offset - guess))
+            loss = loss + JOLT * self._roughness(offset - guess)
             loss.backward(inputs=[offset])
             optimizer.step()
-        self.maps[name][frame] = self._map(offset.detach())[0]
+        self.offsets[name][frame, self.garment] = offset.detach()
         self.fitted[name] += 1
         return Progress(float(loss.detach()), float(mse))
 
@@ -174,7 +173,7 @@ class Registration:
         rest = self.rest.first(name)
         if seen == 0:
             return [rest], False
-        before = self.avatar.at_points(self.maps[name][[frame - 1]])[0, garment]
+        before = self.offsets[name][frame - 1, garment]
         if seen == 1:
             return [before, rest], False
         change = self._inertia(context, name, frame) - before
@@ -185,8 +184,9 @@ class Registration:
 
     def _inertia(self, context: Tensor, name: str, frame: int) -> Float[Tensor, "g 3"]:
         """Return the offsets of cloth that moves on through the world as it did before this frame."""
-        avatar, garment, maps, track = self.avatar, self.garment, self.maps[name], self.tracks[name]
-        newest, older = (self._posed(track[[f]], maps[f : f + 1]) for f in (frame - 1, frame - 2))
+        avatar, garment, track = self.avatar, self.garment, self.tracks[name]
+        past = self.offsets[name][:, garment]
+        newest, older = (self._posed(track[[f]], past[f]) for f in (frame - 1, frame - 2))
         moved = newest + self._smooth(newest - older)
         blended = blend(avatar.control_weights[garment], context[:, :1])[0, 0]
         points = torch.linalg.solve(blended[..., :3], (moved - blended[..., 3])[..., None])[..., 0]
@@ -200,9 +200,7 @@ class Registration:
         background: np.ndarray,
     ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
         """Return loss and squared error of views over a background, and how far neighbours part."""
-        avatar = self.avatar
-        maps = self._map(offset)
-        gaussians = avatar.gaussians(context, self._output(maps))[0]
+        gaussians = self.avatar.gaussians(context, self.avatar.offset_garment(offset[None]))[0]
         color = torch.from_numpy(background.astype(np.float32))
         loss, mse = torch.zeros(()), torch.zeros(())
         for target, share in views:
@@ -211,10 +209,11 @@ class Registration:
             )
             one, error = image_loss(output, target, color, self.loss, None)
             loss, mse = loss + share * one / len(views), mse + error / len(views)
-        return loss + ROUGHNESS * self._roughness(maps), mse
+        return loss + ROUGHNESS * self._roughness(offset), mse
 
-    def _roughness(self, maps: Float[Tensor, "1 3 h w"]) -> Float[Tensor, ""]:
-        return spatial_loss(self.avatar.at_points(maps), self.avatar.links)
+    def _roughness(self, offset: Float[Tensor, "g 3"]) -> Float[Tensor, ""]:
+        output = self.avatar.offset_garment(offset[None])
+        return spatial_loss(self.avatar.at_points(output.offset), self.avatar.links)
 
     def _view(self, name: str, frame: int, camera: int, points: Float[Tensor, "g 3"]) -> tuple[Target, float]:
         """Return a view of the garment around its points in the world, and its share of the person's view."""
@@ -228,16 +227,10 @@ class Registration:
         part = Target(color, alpha, target.camera.cropped(x0, y0, x1 - x0, y1 - y0))
         return part, alpha.numel() / target.alpha.numel()
 
-    def _map(self, offset: Float[Tensor, "g 3"]) -> Float[Tensor, "1 3 h w"]:
-        return self.avatar.offset_garment(offset[None]).offset
-
-    def _posed(self, context: Tensor, maps: Float[Tensor, "1 3 h w"]) -> Float[Tensor, "g 3"]:
+    def _posed(self, context: Tensor, offset: Float[Tensor, "g 3"]) -> Float[Tensor, "g 3"]:
         """Return where the garment's control points are in the world."""
-        return self.avatar.deformed_control_points(context, self._output(maps))[0, self.garment]
-
-    def _output(self, maps: Float[Tensor, "1 3 h w"]) -> NetworkOutput:
-        looks = self.avatar.model.appearance_channels
-        return NetworkOutput(maps, maps.new_zeros(1, looks, *self.avatar.grid_size), ())
+        output = self.avatar.offset_garment(offset[None])
+        return self.avatar.deformed_control_points(context, output)[0, self.garment]
 
     def _smooth(self, vectors: Float[Tensor, "g 3"]) -> Float[Tensor, "g 3"]:
         """Return the mean of each control point of the garment and its neighbours."""

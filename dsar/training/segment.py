@@ -80,7 +80,7 @@ class SegmentTrainer:
         )
         self.state: NetworkState = avatar.start(config.schedule.streams)
         self.registered: Mapping[str, tuple[range, Tensor]] = {}
-        """Frames that have a registered map, and the maps, by sequence."""
+        """Frames that have a registered map, and the maps at the control points, by sequence."""
         self.records: deque[TemporalRecord] = deque(maxlen=3)
         self.speeds: deque[Tensor] = deque(maxlen=max(2, config.model.window))
         """Motion magnitudes of the window's frames, oldest first."""
@@ -215,12 +215,12 @@ class SegmentTrainer:
     def _registered(self, step: "_Step") -> Tensor:
         """Return the mean distance, cm, to the registered maps; frames without one count as reached."""
         known = [p.frame in self.registered.get(p.sequence, _NO_MAPS)[0] for p in step.places]
-        maps = [
-            self.registered[place.sequence][1][place.frame] if has else torch.zeros_like(answer)
-            for has, place, answer in zip(known, step.places, step.answer.offset, strict=True)
+        answers = self.avatar.at_points(step.answer.offset)
+        wanted = [
+            self.registered[place.sequence][1][place.frame] if has else torch.zeros_like(answers[0])
+            for has, place in zip(known, step.places, strict=True)
         ]
-        answers, wanted = map(self.avatar.at_points, (step.answer.offset, torch.stack(maps)))
-        distances = registered_loss(answers, wanted)
+        distances = registered_loss(answers, torch.stack(wanted))
         return (distances * torch.tensor(known)).mean()
 
     def _compare_gradients(self, losses: Mapping[str, Tensor]) -> dict[str, float] | None:
