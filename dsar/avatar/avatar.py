@@ -226,11 +226,16 @@ class Avatar(nn.Module):
         """Return a map's offsets at the control points, along their own axes, metres."""
         return offset.flatten(2)[:, :, self.cells].transpose(1, 2)
 
+    def among_points(self, offsets: Float[Tensor, "b g 3"]) -> Float[Tensor, "b p 3"]:
+        """Return the garment's offsets among those of all control points, which stay where they are."""
+        still = offsets.new_zeros(len(offsets), len(self.cells), 3)
+        return still.index_copy(1, self.garment_points(), offsets)
+
     def offset_garment(self, offsets: Float[Tensor, "b g 3"]) -> NetworkOutput:
         """Return an output that moves the garment's control points by these offsets, and nothing else."""
         batch, (h, w) = len(offsets), self.grid_size
-        cells = self.cells[self.garment_points()]
-        flat = offsets.new_zeros(batch, 3, h * w).index_copy(2, cells, offsets.transpose(1, 2))
+        moved = self.among_points(offsets).transpose(1, 2)
+        flat = offsets.new_zeros(batch, 3, h * w).index_copy(2, self.cells, moved)
         looks = offsets.new_zeros(batch, self.model.appearance_channels, h, w)
         return NetworkOutput(flat.unflatten(2, (h, w)), looks, ())
 
@@ -280,9 +285,8 @@ class Avatar(nn.Module):
         self, context: Float[Tensor, "b t j 4 4"], output: NetworkOutput
     ) -> Float[Tensor, "b p 3"]:
         """Return the newest frame's control points, offset and posed, world metres."""
-        points = self.control_points + (self.control_axes * self.at_points(output.offset)[..., None, :]).sum(
-            -1
-        )
+        offsets = self.at_points(output.offset)
+        points = self.control_points + (self.control_axes * offsets[..., None, :]).sum(-1)
         blended = blend(self.control_weights, context[:, :1])[:, 0]
         return (blended[..., :3] * points[..., None, :]).sum(-1) + blended[..., 3]
 

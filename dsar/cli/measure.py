@@ -48,13 +48,15 @@ class Eval(Common):
         from dsar.training.checkpoint import write_whole
 
         self.check_device()
+        every = ABLATIONS | BASELINES
         tables = (ABLATIONS if self.ablations else {}) | (BASELINES if self.baselines else {})
         study = Study(self.study, self.minutes, self.capture)
         with Bar(self.progress, "study").running() as bar:
             complete = study.run(list(tables.values()), self.hours, lambda what, share: bar.show(share, what))
         summary = summarize_tables(study, tables)
-        found = {"complete": complete, "minutes": self.minutes, "tables": summary}
-        self.write_json(found)
+        facts = {"complete": complete, "minutes": self.minutes, "capture": self.capture}
+        self.write_json(facts | {"tables": summary})
+        found = facts | {"tables": summarize_tables(study, every)}
         write_whole(self.study / "study.json", json.dumps(found, indent=1) + "\n")
         sys.stdout.write(to_markdown(summary))
         if not complete:

@@ -101,8 +101,8 @@ def garment_mask(
     pixels = project(camera, vertices)[0]
     picture = Image.new("1", (camera.width, camera.height))
     draw = ImageDraw.Draw(picture)
-    # Pillow names a pixel after its centre, the project after its corner.
-    for triangle in (pixels[faces] - 0.5).tolist():
+    # Pillow fills the pixels that hold the corners, and all between.
+    for triangle in pixels[faces].floor().tolist():
         draw.polygon([tuple(corner) for corner in triangle], fill=1)
     return torch.from_numpy(np.array(picture))
 

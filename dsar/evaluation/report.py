@@ -21,7 +21,10 @@ from dsar.evaluation.study.summary import table_cells
 from dsar.training.checkpoint import Run, read_progress, write_whole
 
 _STAGES = {"template": "#9aa5b1", "imitation": "#c77d0a", "pose": "#4c78a8", "autoregressive": "#2a7f62"}
-_METRICS = ("psnr", "psnr_box", "psnr_box_template", "ssim", "lpips", "flip", "tpsnr", "warp_error", "vmaf")
+_METRICS = (
+    *("psnr", "psnr_box", "psnr_box_template", "psnr_garment", "ssim", "lpips", "lpips_vgg", "flip"),
+    *("tpsnr", "warp_error", "vmaf", "mmd"),
+)
 _PREVIEWS = (
     ("compare.mp4", "Side by side", "Truth and avatar, on a motion that training never saw."),
     ("sheet.png", "Frames it never saw", "Truth above, the avatar below."),
@@ -37,6 +40,8 @@ def write_report(run: Run) -> Path:
     """
     config, lines = config_from_json(run.config), _lines(run)
     figures, battery, study = map(_read, (run.figures, run.stress, run.study))
+    # Models of another capture are no measure of this one.
+    study = study if study and study["capture"] == config.capture else None
     splits = {name: values for name, values in (figures or {}).get("splits", {}).items() if values}
     metrics = [key for key in _METRICS if any(values.get(key) is not None for values in splits.values())]
     facts = {

@@ -5,6 +5,7 @@ checkpoint/              replaced as a whole, never half written
     avatar.safetensors       parameters, skeleton, atlas
     adam.safetensors, muon.safetensors   moments of the optimisers
     rollouts-<rank>.safetensors, rollouts-<rank>.json   carried state of each worker's rollouts
+    registration-<rank>.safetensors   offsets of the still and the registered frames
     progress.json            step, progress, format version
 metrics.jsonl            one line per report
 figures.json, stress.json   what `dsar eval` and `dsar stress` found
@@ -30,7 +31,7 @@ from dsar.body.model import PARENTS, Body
 from dsar.config import TrainConfig, config_from_json
 from dsar.errors import CheckpointError, ConfigError
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 _BODY = ("vertices", "faces", "joints", "weights", "uv", "uv_faces")
 
 

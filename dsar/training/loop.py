@@ -226,7 +226,8 @@ def still_frames(trainer: SegmentTrainer, fps: float) -> list[tuple[str, int]]:
 def bad_gradient(avatar: Avatar) -> str:
     """Return the name of the first parameter whose gradient is not finite."""
     named = avatar.named_parameters()
-    return next(name for name, p in named if p.grad is not None and not p.grad.isfinite().all())
+    bad = (name for name, p in named if p.grad is not None and not p.grad.isfinite().all())
+    return next(bad, "the still frames' offsets")
 
 
 def save(

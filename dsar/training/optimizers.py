@@ -22,6 +22,7 @@ _TEMPLATE_RATES = {
 _TRAVEL = 10.0
 """Factor on the means' rate while the template is fitted: the garment's chart is centimetres off."""
 _REST_RATE = 3e-3
+"""Adam's step of the still frames' offsets, metres."""
 
 
 def make_optimizers(

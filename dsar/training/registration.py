@@ -185,8 +185,8 @@ class Registration:
     def _inertia(self, context: Tensor, name: str, frame: int) -> Float[Tensor, "g 3"]:
         """Return the offsets of cloth that moves on through the world as it did before this frame."""
         avatar, garment, track = self.avatar, self.garment, self.tracks[name]
-        past = self.offsets[name][:, garment]
-        newest, older = (self._posed(track[[f]], past[f]) for f in (frame - 1, frame - 2))
+        past = self.offsets[name]
+        newest, older = (self._posed(track[[f]], past[f, garment]) for f in (frame - 1, frame - 2))
         moved = newest + self._smooth(newest - older)
         blended = blend(avatar.control_weights[garment], context[:, :1])[0, 0]
         points = torch.linalg.solve(blended[..., :3], (moved - blended[..., 3])[..., None])[..., 0]
@@ -212,8 +212,7 @@ class Registration:
         return loss + ROUGHNESS * self._roughness(offset), mse
 
     def _roughness(self, offset: Float[Tensor, "g 3"]) -> Float[Tensor, ""]:
-        output = self.avatar.offset_garment(offset[None])
-        return spatial_loss(self.avatar.at_points(output.offset), self.avatar.links)
+        return spatial_loss(self.avatar.among_points(offset[None]), self.avatar.links)
 
     def _view(self, name: str, frame: int, camera: int, points: Float[Tensor, "g 3"]) -> tuple[Target, float]:
         """Return a view of the garment around its points in the world, and its share of the person's view."""

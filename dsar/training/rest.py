@@ -27,6 +27,12 @@ class RestShapes(nn.Module):
         """Sequence and frame of each shape."""
         self.offsets = nn.Parameter(torch.zeros(len(frames), len(avatar.garment_points()), 3))
         """Offsets of the garment's control points along their axes, metres."""
+        self._garment = avatar.garment_texels()
+        self._chart = avatar.texel_positions[self._garment]
+        cells = avatar.texels[self._garment]
+        self._links = (
+            surface_links(cells, avatar.atlas_size, self._chart) if len(cells) else cells.reshape(0, 2)
+        )
 
     def output(self, avatar: Avatar, index: int) -> NetworkOutput:
         """Return the output that gives the garment the shape it has in one of the frames."""
@@ -41,12 +47,9 @@ class RestShapes(nn.Module):
 
     def loss(self, avatar: Avatar, config: LossConfig) -> Float[Tensor, ""]:
         """Return what keeps the cloth in one piece: neighbours move together, in the template and off it."""
-        garment = avatar.garment_texels()
-        if not len(garment):
+        if not len(self._garment):
             return self.offsets.new_zeros(())
-        chart = avatar.texel_positions[garment]
-        links = surface_links(avatar.texels[garment], avatar.atlas_size, chart)
-        moved = (avatar.template.means[garment] - chart)[None]
-        together = spatial_loss(avatar.at_points(avatar.offset_garment(self.offsets).offset), avatar.links)
+        moved = (avatar.template.means[self._garment] - self._chart)[None]
+        together = spatial_loss(avatar.among_points(self.offsets), avatar.links)
         pull = (self.offsets * CENTIMETRES).square().sum(-1).mean()
-        return config.shape * spatial_loss(moved, links) + config.spatial * together + PULL * pull
+        return config.shape * spatial_loss(moved, self._links) + config.spatial * together + PULL * pull

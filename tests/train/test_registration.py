@@ -45,7 +45,8 @@ def registered():
     avatar.reveal()
     clips = {SEQUENCE: range(4, LAST + 1)}
     registration = Registration(config, capture, avatar, rest, trainer.tracks, clips)
-    copy = Registration(config, capture, avatar, rest, trainer.tracks, clips)
+    forgotten = RestShapes(avatar, rest.frames)
+    copy = Registration(config, capture, avatar, forgotten, trainer.tracks, clips)
     for _ in range(LAST - 5):
         registration.advance()
     copy.carry_on({name: tensor.clone() for name, tensor in registration.carried().items()})
@@ -131,6 +132,7 @@ def test_registration_goes_on_where_it_was_interrupted(registered):
     _, _, registration, copy = registered
     assert torch.equal(registration.offsets[SEQUENCE], copy.offsets[SEQUENCE])
     assert registration.result[SEQUENCE][0] == copy.result[SEQUENCE][0]
+    assert torch.equal(registration.rest.offsets, copy.rest.offsets)
 
 
 def test_the_network_learns_to_follow_maps_that_lag_behind_the_motion(registered):

@@ -69,18 +69,21 @@ def test_a_study_goes_on_with_what_is_missing_and_does_nothing_twice(tiny_captur
     told.clear()
     assert study.run(tables, hours=0.0, report=lambda *what: told.append(what))
     assert told == [("done", 1.0)]
-    with pytest.raises(ConfigError, match=r"full,seed=0/figures\.json is of a model with other settings"):
+    with pytest.raises(ConfigError, match=r"full,seed=0/measured\.json is of a model with other settings"):
         Study(tmp_path, 0.1, str(tiny_capture)).run(tables)
-    (tmp_path / "feedback=0,seed=0" / "figures.json").unlink()
+    (tmp_path / "feedback=0,seed=0" / "measured.json").unlink()
     with pytest.raises(ConfigError, match="feedback=0,seed=0 is of a model with other settings"):
         Study(tmp_path, 0.1, str(tiny_capture)).run([Table("less", (TINY["tiny"].rows[1],))])
 
     summary = summarize_tables(study, TINY)
     run = Run(tmp_path / "full,seed=0")
-    write_whole(run.study, json.dumps({"complete": False, "minutes": 0.05, "tables": summary}))
+    found = {"complete": False, "minutes": 0.05, "capture": str(tiny_capture), "tables": summary}
+    write_whole(run.study, json.dumps(found))
     page = write_report(run).read_text()
-    for text in ("Beside other models", "not complete yet", "no feedback", "this run"):
+    for text in ("Beside other models", "not complete yet", "no feedback"):
         assert text in page
+    write_whole(run.study, json.dumps(found | {"capture": "embedded"}))
+    assert "No study beside this run" in write_report(run).read_text()
     full, less, zeroed = summary["tiny"]["rows"]
     assert full["seeds"] == zeroed["seeds"] == [0]
     assert less["seeds"] == []

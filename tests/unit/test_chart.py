@@ -35,11 +35,20 @@ def test_zeroed_and_missing_rows_are_no_models():
     row = {"label": "full", "settings": {}, "zeroed": [], "mean": mean}
     rows = [row, row | {"label": "again"}, row | {"zeroed": ["state"], "settings": {"a": 1}}]
     rows.append(row | {"settings": {"b": 1}, "mean": dict.fromkeys(mean)})
-    longer = row | {
-        "settings": {"schedule.minutes": 20.0},
-        "mean": mean | {"psnr_box": 22.0, "minutes": 20.0},
+    other = {"split": "test", "rows": [row | {"settings": {"c": 1}}]}
+    longer = (
+        row
+        | {"label": "for long"}
+        | {
+            "settings": {"schedule.minutes": 20.0},
+            "mean": mean | {"psnr_box": 22.0, "minutes": 20.0},
+        }
+    )
+    summary = {
+        "table": {"split": "fd", "rows": rows},
+        "time": {"split": "fd", "rows": [longer]},
+        "other": other,
     }
-    summary = {"table": {"rows": rows}, "time": {"rows": [longer]}}
     assert points_of(summary) == [Point("full", 20.0, 21.0, None, 100.0, 1.0)]
     assert times_of(summary) == {"full": [(5.0, 21.0), (20.0, 22.0)]}
 

@@ -17,7 +17,7 @@ PAPER = {
 Quality = Literal["psnr_box", "lpips"]
 QUALITIES: tuple[Quality, ...] = ("psnr_box", "lpips")
 _LABELS: Mapping[Quality, str] = {"psnr_box": "PSNR, dB (ours: in the mask's box)", "lpips": "LPIPS"}
-_TIME = "schedule.minutes"
+_TIME, _SPLIT = "schedule.minutes", "fd"
 _AREA = 200
 """Points² of the marker of the model with most Gaussians."""
 
@@ -62,7 +62,8 @@ def times_of(summary: Mapping[str, Any]) -> dict[str, list[tuple[float, float]]]
 
 
 def _rows(summary: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    rows = [row for table in summary.values() for row in table["rows"]]
+    # Figures of another split are of other frames.
+    rows = [row for table in summary.values() if table["split"] == _SPLIT for row in table["rows"]]
     return [row for row in rows if not row["zeroed"] and row["mean"]["fps"]]
 
 

@@ -123,8 +123,8 @@ class Study:
 
     def _model(self, row: Row, seed: int) -> Model:
         # A row of the study's own length is the same model as one that names no length.
-        same = {"schedule.minutes": self.minutes}
-        return Model({k: v for k, v in row.settings.items() if same.get(k) != v}, seed)
+        same = ("schedule.minutes", self.minutes)
+        return Model({key: value for key, value in row.settings.items() if (key, value) != same}, seed)
 
     def _expected(self, model: Model) -> float:
         """Return the minutes that a model takes."""
@@ -135,12 +135,12 @@ class Study:
 
     def _figures(self, each: Measurement) -> Path:
         suffix = "".join(f"-without-{stream}" for stream in each.zeroed)
-        return self._run(each.model).folder / f"figures{suffix}.json"
+        return self._run(each.model).folder / f"measured{suffix}.json"
 
     def _measured(self, each: Measurement) -> bool:
         path = self._figures(each)
         if path.exists():
-            self._check(path, json.loads(path.read_text())["config"], each.model)
+            self._check(path, json.loads(path.read_text()).get("config"), each.model)
         return path.exists()
 
     def _trained(self, model: Model) -> bool:
@@ -165,7 +165,6 @@ class Study:
             "config": json.loads(config_to_json(config)),
             "settings": dict(model.settings),
             "seed": model.seed,
-            "minutes": self.minutes,
             **provenance,
         }
         found |= {"updates": read_progress(run)["step"], **evaluate(avatar, capture, streams=streams)}

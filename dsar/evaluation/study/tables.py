@@ -186,7 +186,7 @@ ABLATIONS: dict[str, Table] = {
 ABLATIONS["time"] = Table(
     "Training time",
     tuple(
-        Row(f"{label}, {minutes:g} minutes", {**settings, "schedule.minutes": minutes})
+        Row(label, {**settings, "schedule.minutes": minutes})
         for minutes in (2.5, 10.0, 20.0)
         for label, settings in (("full model", {}), ("pose only", _POSE_ONLY))
     ),
