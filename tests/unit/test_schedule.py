@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+import torch
 
 from dsar.config import PRESETS, ScheduleConfig, TrainConfig, config_from_json, config_to_json
 from dsar.errors import ConfigError
+from dsar.training.optimizers import set_rates
 from dsar.training.stages import WHOLE_CLIP, position
 from dsar.training.streams import Streams
 
@@ -21,6 +23,31 @@ def test_stages_follow_each_other_and_the_horizon_only_grows():
     assert horizons[-1] == WHOLE_CLIP
     assert sum(h == WHOLE_CLIP for h in horizons) >= 0.45 * len(horizons)
     assert walk[-1].network_rate < 0.03 * schedule.learning_rate
+
+
+def test_only_a_new_template_travels_far_and_has_shapes_of_its_own_in_still_frames():
+    schedule = ScheduleConfig(pose_share=0.15, horizon=16)
+
+    def rates(progress: float) -> tuple[str, dict[str, float]]:
+        names = ("means", "quaternions", "log_scales", "opacity_logits", "harmonics", "network", "rest")
+        groups = [{"params": [torch.nn.Parameter(torch.zeros(1))], "name": name} for name in names]
+        adam = torch.optim.Adam(groups, lr=1.0)
+        now = position(schedule, progress)
+        set_rates({"adam": adam}, now)
+        return now.stage, {group["name"]: group["lr"] for group in adam.param_groups}
+
+    walk = [rates(i / 1000) for i in range(1000)]
+    fitted = [rate for stage, rate in walk if stage == "template"]
+    later = [rate for stage, rate in walk if stage != "template"]
+    assert min(rate["rest"] for rate in fitted) > 0
+    assert max(rate["rest"] for rate in later) == 0
+    assert {rate["network"] for rate in fitted} == {0}
+    # Beside the other parameters, means move ten times as far as later.
+    shares = [
+        {round(rate["means"] / rate["quaternions"], 6) for rate in part if rate["quaternions"]}
+        for part in (fitted, later)
+    ]
+    assert shares == [{2.0}, {0.2}]
 
 
 def test_rollouts_restart_at_the_horizon_and_at_the_end_of_a_clip():

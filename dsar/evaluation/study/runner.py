@@ -103,9 +103,8 @@ class Study:
             if self._measured(each):
                 continue
             if not self._trained(each.model):
-                if hours is not None and time.monotonic() - began > 3600 * hours - 60 * self._expected(
-                    each.model
-                ):
+                ends = time.monotonic() - began + 60 * self._expected(each.model)
+                if hours is not None and ends > 3600 * hours:
                     return False
                 run, what = self._run(each.model), f"train {each.model.name}"
                 follow = partial(_follow, report, what, done, len(needed))
