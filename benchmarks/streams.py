@@ -17,8 +17,8 @@ from results import write_json
 
 from dsar.avatar.avatar import Avatar
 from dsar.avatar.rollout import START_FRAME, network_outputs, roll_out
-from dsar.data.capture import open_capture
-from dsar.data.native import NativeCapture
+from dsar.data.capture import capture_of
+from dsar.data.multiview import MultiViewCapture
 from dsar.evaluation.heldout import compare, evaluate_sequence, one_to_many
 from dsar.evaluation.horizon import looped
 from dsar.evaluation.settling import rms_speeds, settle_time
@@ -31,7 +31,7 @@ SLOW = 0.2
 HORIZONS = (1, 10, 50)
 
 
-def measure_streams(avatar: Avatar, capture: NativeCapture, stride: int) -> dict:
+def measure_streams(avatar: Avatar, capture: MultiViewCapture, stride: int) -> dict:
     """Return PSNR and one-to-many figures with both streams, each alone, and none."""
     found = {}
     for name, streams in VARIANTS.items():
@@ -44,7 +44,7 @@ def measure_streams(avatar: Avatar, capture: NativeCapture, stride: int) -> dict
     return found
 
 
-def measure_settling(avatar: Avatar, capture: NativeCapture) -> dict:
+def measure_settling(avatar: Avatar, capture: MultiViewCapture) -> dict:
     """Return how long the garment moves after the stop, seconds: the true one and each variant's."""
     pair, garment = capture.one_to_many[0], avatar.garment_points()
     motion, (start, end) = capture.motions[pair.sequence], pair.after_stop
@@ -66,7 +66,9 @@ def measure_settling(avatar: Avatar, capture: NativeCapture) -> dict:
     return found
 
 
-def measure_horizon(avatar: Avatar, capture: NativeCapture, stride: int, horizons: tuple[int, ...]) -> dict:
+def measure_horizon(
+    avatar: Avatar, capture: MultiViewCapture, stride: int, horizons: tuple[int, ...]
+) -> dict:
     """Return the root mean square error in the mask's box of the rounds that lie at multiples of a clip."""
     sequence = capture.splits["fd"][0] if capture.splits.get("fd") else capture.splits["test"][0]
     motion = capture.motions[sequence]
@@ -100,7 +102,7 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     avatar, config, provenance = load_checkpoint(Run(arguments.run))
-    capture = open_capture(config.capture)
+    capture = capture_of(config)
     stride, horizons = (20, (1, 10)) if arguments.quick else (4, HORIZONS)
     found = {"run": str(arguments.run), **provenance, "wiring": config.model.wiring, "seed": config.seed}
     found |= {"recall": float(avatar.network.bank.recall_logit.sigmoid()) if avatar.network.bank else None}

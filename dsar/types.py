@@ -203,6 +203,10 @@ class Capture(Protocol):
         """Sequence names of `train` and `test`, and of labelled subsets such as `nd` and `fd`."""
         ...
 
+    def seen_by(self, sequence: str, frame: int) -> Sequence[int]:
+        """Return the cameras that have an image of a frame with its mask, by index."""
+        ...
+
     def image(self, sequence: str, frame: int, camera: int) -> UInt8[np.ndarray, "h w 4"]:
         """Return one image: straight (not premultiplied) sRGB and the mask as alpha."""
         ...

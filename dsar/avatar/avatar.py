@@ -140,9 +140,9 @@ class Avatar(nn.Module):
         poses = motion.rotations.to(self.body_joints), motion.translations.to(self.body_joints)
         transforms, pelvis = forward_kinematics(self.body, *poses), self.body_joints[0]
         for frame in find_jumps(transforms, pelvis, motion.fps):
-            seconds = frame / motion.fps
             _log.warning(
-                "Motion %s: the body jumps after %.2f s; its clothes go with it", motion.name, seconds
+                "Motion %s: the body jumps at frame %d of %d (%.2f s); its clothes go with it",
+                *(motion.name, frame, len(motion), frame / motion.fps),
             )
         return make_track(transforms, pelvis, motion.fps, self.model.lags)
 

@@ -112,7 +112,8 @@ def hull_radii(
     for (sequence, frame), transform in zip(frames, pelvis, strict=True):
         world = samples @ transform[:3, :3].T + transform[:3, 3]
         inside = torch.ones(world.shape[:-1], dtype=torch.bool)
-        for index, camera in enumerate(capture.cameras):
+        for index in capture.seen_by(sequence, frame):
+            camera = capture.cameras[index]
             mask = torch.from_numpy(capture.image(sequence, frame, index)[..., 3] > 127)
             pixels, depth = project(camera, world)
             inside &= _lookup(mask, pixels) & (depth > 0)

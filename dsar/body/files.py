@@ -1,16 +1,13 @@
 """Body-model files in SMPL-X's format: the embedded CC0 body, or a licensed SMPL-X or SMPL-H file.
 
-Nothing in a file is executed: .npz is read without pickle, .pkl through an unpickler that builds
-arrays and nothing else.
+Nothing in a file is executed: .npz is read without pickle, .pkl by `dsar.pickles`.
 """
 
-import pickle
-import warnings
+import os
 import zipfile
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, BinaryIO
 
 import numpy as np
 import torch
@@ -19,16 +16,17 @@ from torch import Tensor
 
 from dsar.body.model import FACE_JOINTS, HEAD, JOINT_NAMES, PARENTS, Body
 from dsar.errors import BodyError
+from dsar.pickles import PICKLE_ERRORS, read_pickle
 
 EMBEDDED_BODY = Path(__file__).parent / "data" / "body.npz"
 """The body that comes with the package: an adult woman made from MakeHuman's CC0 data."""
 
 _REQUIRED = ("v_template", "shapedirs", "weights", "kintree_table", "f")
 _UV_KEYS = ("vt", "ft")
+_HAND_KEYS = (("hands_componentsl", "hands_componentsr"), ("hands_meanl", "hands_meanr"))
 _OPTIONAL = ("J_regressor", "j_template", "j_shapedirs")
-# What NumPy raises on a damaged .npz, and `pickle`, by its manual, on a damaged .pkl.
+# What NumPy raises on a damaged .npz.
 _DAMAGE_ERRORS = (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error)
-_PICKLE_ERRORS = (pickle.UnpicklingError, AttributeError, ImportError, LookupError, TypeError)
 _DIRECTIONS = {"shapedirs", "j_shapedirs"}
 # Columns of `shapedirs` in the published SMPL-X files, of which the rest are expressions.
 _SHAPES_OF_COLUMNS = {20: 10, 400: 300}
@@ -77,15 +75,56 @@ def load_body(path: Path | None = None, betas: Float[Tensor, " s"] | None = None
     )
 
 
-def _read_arrays(path: Path) -> dict[str, np.ndarray]:
+def choose_body(path: Path | None, gender: str) -> Path | None:
+    """Return the body-model file that a user chose, by argument or in $DSAR_BODY; None if they did not.
+
+    Args:
+        path: A file, or a folder with SMPLX_<GENDER>.npz or .pkl.
+        gender: `neutral`, `female` or `male`: which of a folder's files.
+
+    Raises:
+        BodyError: the folder has no such file.
+    """
+    chosen = path or (Path(os.environ["DSAR_BODY"]) if os.environ.get("DSAR_BODY") else None)
+    if chosen is None or not chosen.is_dir():
+        return chosen
+    names = [f"SMPLX_{gender.upper()}{suffix}" for suffix in (".npz", ".pkl")]
+    found = next((chosen / name for name in names if (chosen / name).is_file()), None)
+    if found is None:
+        raise BodyError(f"body folder {chosen}: has neither {' nor '.join(names)}; give the file itself")
+    return found
+
+
+def load_hands(path: Path) -> tuple[Float[Tensor, "2 k 45"], Float[Tensor, "2 45"]]:
+    """Return the principal components of the hands' poses and the mean poses: left, then right; radians.
+
+    Raises:
+        BodyError: the file has none.
+    """
+    found = _read_arrays(path, tuple(key for keys in _HAND_KEYS for key in keys))
+    missing = [key for keys in _HAND_KEYS for key in keys if key not in found]
+    if missing:
+        raise BodyError(
+            f"body file {path}: lacks {', '.join(missing)}, without which hands given as principal "
+            "components mean nothing; use SMPL-X's own file"
+        )
+    components, means = (
+        torch.stack([_as_float(_as_numbers(path, key, found[key])) for key in keys]) for keys in _HAND_KEYS
+    )
+    if components.shape[-1] != 45 or means.shape != (2, 45):
+        raise BodyError(f"body file {path}: hands have shapes {tuple(components.shape)}, expected (2, k, 45)")
+    return components, means
+
+
+def _read_arrays(path: Path, also: tuple[str, ...] = ()) -> dict[str, np.ndarray]:
     """Return the arrays of a body file that we use; the rest is not opened."""
     if path.suffix not in (".npz", ".pkl"):
         raise BodyError(f"body file {path}: expected a .npz or .pkl file, found suffix {path.suffix!r}")
     if not path.is_file():
         raise BodyError(f"body file {path}: no such file; give the path of an SMPL-X .npz or .pkl file")
     try:
-        found = _read_npz(path) if path.suffix == ".npz" else _read_pickle(path)
-    except (*_DAMAGE_ERRORS, *_PICKLE_ERRORS) as error:
+        found = _read_npz(path, also) if path.suffix == ".npz" else _read_pickle(path, also)
+    except (*_DAMAGE_ERRORS, *PICKLE_ERRORS) as error:
         raise BodyError(f"body file {path}: cannot be read ({error}); download it again") from error
     missing = [key for key in _REQUIRED if key not in found]
     if not ("J_regressor" in found or {"j_template", "j_shapedirs"} <= found.keys()):
@@ -102,67 +141,18 @@ def _read_arrays(path: Path) -> dict[str, np.ndarray]:
     return found
 
 
-def _read_npz(path: Path) -> dict[str, np.ndarray]:
+def _read_npz(path: Path, also: tuple[str, ...]) -> dict[str, np.ndarray]:
     with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-        return {key: file[key] for key in (*_REQUIRED, *_UV_KEYS, *_OPTIONAL) if key in file.files}
+        return {key: file[key] for key in (*_REQUIRED, *_UV_KEYS, *_OPTIONAL, *also) if key in file.files}
 
 
-def _read_pickle(path: Path) -> dict[str, np.ndarray]:
-    with path.open("rb") as file, warnings.catch_warnings():
-        # Files written by Python 2 spell the dtype's `align` as 0 or 1.
-        warnings.filterwarnings("ignore", r"dtype\(\): align", np.exceptions.VisibleDeprecationWarning)
-        content = _ArrayUnpickler(file).load()
+def _read_pickle(path: Path, also: tuple[str, ...]) -> dict[str, np.ndarray]:
+    content = read_pickle(path)
     if not isinstance(content, Mapping):
         raise ValueError(f"holds a {type(content).__name__}, not a dictionary")
-    return {key: np.asarray(content[key]) for key in (*_REQUIRED, *_UV_KEYS, *_OPTIONAL) if key in content}
-
-
-class _ArrayUnpickler(pickle.Unpickler):
-    """Unpickles arrays, those of chumpy and SciPy in published files included, and refuses the rest."""
-
-    _ALLOWED = frozenset(
-        {
-            *(("numpy", name) for name in ("ndarray", "dtype")),
-            *((f"numpy.{c}.multiarray", n) for c in ("core", "_core") for n in ("_reconstruct", "scalar")),
-            *((f"numpy.{c}.numeric", "_frombuffer") for c in ("core", "_core")),
-            ("_codecs", "encode"),
-            ("collections", "OrderedDict"),
-            *((module, "object") for module in ("builtins", "__builtin__")),
-            *((module, "_reconstructor") for module in ("copyreg", "copy_reg")),
-        }
-    )
-
-    def __init__(self, file: BinaryIO) -> None:
-        # The published files were written by Python 2, whose strings are bytes.
-        super().__init__(file, encoding="latin1")
-
-    def find_class(self, module: str, name: str) -> Any:
-        """Return the class of a name in the file, or a stand-in that only holds state."""
-        if module.split(".")[0] == "chumpy" or (module.startswith("scipy.sparse") and name == "csc_matrix"):
-            return _StateHolder
-        if (module, name) in self._ALLOWED:
-            return super().find_class(module, name)
-        raise pickle.UnpicklingError(f"it refers to {module}.{name}, which no body model needs")
-
-
-class _StateHolder:
-    """Stands for a chumpy array or a SciPy CSC matrix without running their code."""
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
-        """Return the held values as a dense array."""
-        state = vars(self)
-        if "indptr" in state:
-            rows, count = state["_shape"]
-            dense = np.zeros((rows, count))
-            columns = np.repeat(np.arange(count), np.diff(state["indptr"]))
-            dense[state["indices"], columns] = state["data"]
-            return dense.astype(dtype or dense.dtype)
-        if "x" in state:
-            return np.asarray(state["x"], dtype=dtype)
-        if {"a", "idxs", "preferred_shape"} <= state.keys():
-            source = np.asarray(state["a"], dtype=dtype).reshape(-1)
-            return source[np.asarray(state["idxs"])].reshape(state["preferred_shape"])
-        raise ValueError(f"an array stored as {sorted(state)} is not understood")
+    return {
+        key: np.asarray(content[key]) for key in (*_REQUIRED, *_UV_KEYS, *_OPTIONAL, *also) if key in content
+    }
 
 
 def _as_numbers(path: Path, key: str, array: np.ndarray) -> np.ndarray:

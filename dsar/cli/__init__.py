@@ -8,6 +8,7 @@ from typing import Annotated
 
 import tyro
 
+from dsar.cli.check import Check
 from dsar.cli.deliver import Export, Render
 from dsar.cli.measure import Eval, Stress
 from dsar.cli.train import Train
@@ -15,7 +16,7 @@ from dsar.config import PRESETS
 from dsar.errors import DsarError
 
 
-def parse(arguments: Sequence[str]) -> Train | Export | Render | Eval | Stress:
+def parse(arguments: Sequence[str]) -> Train | Check | Export | Render | Eval | Stress:
     """Return the command that the arguments ask for; the preset decides the other defaults."""
     preset = "demo"
     for flag, value in itertools.pairwise(arguments):
@@ -25,6 +26,7 @@ def parse(arguments: Sequence[str]) -> Train | Export | Render | Eval | Stress:
     default = Train(atlas=chosen.atlas, model=chosen.model, loss=chosen.loss, schedule=chosen.schedule)
     commands = (
         Annotated[Train, tyro.conf.subcommand("train", default=default)]
+        | Annotated[Check, tyro.conf.subcommand("check")]
         | Annotated[Export, tyro.conf.subcommand("export")]
         | Annotated[Render, tyro.conf.subcommand("render")]
         | Annotated[Eval, tyro.conf.subcommand("eval")]

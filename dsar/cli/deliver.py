@@ -20,15 +20,17 @@ class Drive(Common):
     run_folder: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(name="run")] = None
     """Run folder; default: the newest under runs/."""
     motion: str = "test"
-    """An AMASS/SMPL-X .npz file, a sequence of the run's capture, or its split `test` or `train`."""
+    """An AMASS/SMPL-X .npz or .bvh file, a sequence of the run's capture, or its split `test` or `train`."""
     frames: str | None = None
     """Frame numbers from 1001 on, e.g. 1001-1100x2; default: all."""
 
     def open(self) -> tuple[GaussianSequence, list[Camera], str]:
         """Return the rollout, the capture's cameras and the motion's name."""
         from dsar.avatar import roll_out
-        from dsar.data.capture import open_capture
+        from dsar.avatar.rollout import START_FRAME
+        from dsar.data.capture import capture_of
         from dsar.data.motion import read_motion, resample
+        from dsar.data.speeds import warn_of_speed
         from dsar.training.checkpoint import Run, load_checkpoint, newest_run
         from dsar_exporters import parse_frames
 
@@ -36,7 +38,7 @@ class Drive(Common):
         run = Run(self.run_folder) if self.run_folder else newest_run()
         frames = None if self.frames is None else parse_frames(self.frames)
         avatar, config, provenance = load_checkpoint(run)
-        capture = open_capture(config.capture)
+        capture = capture_of(config)
         name = capture_sequence(capture, self.motion)
         if name is not None:
             motion = capture.motions[name]
@@ -44,6 +46,9 @@ class Drive(Common):
             motion = read_motion(Path(self.motion), avatar.body)
         if motion.fps != avatar.fps:
             motion = resample(motion, avatar.fps)
+        if name is None:
+            known = [capture.motions[trained] for trained in capture.splits["train"]]
+            warn_of_speed(avatar.body, motion, known, START_FRAME)
         sequence = roll_out(avatar, motion, frames=frames, provenance=provenance)
         return sequence, list(capture.cameras), motion.name
 

@@ -67,7 +67,7 @@ class Eval(Common):
 
     def run_heldout(self) -> None:
         """Measure one run."""
-        from dsar.data.capture import open_capture
+        from dsar.data.capture import capture_of
         from dsar.evaluation.heldout import evaluate
         from dsar.evaluation.report import write_report
         from dsar.training.checkpoint import Run, load_checkpoint, newest_run, write_whole
@@ -75,7 +75,7 @@ class Eval(Common):
         self.check_device()
         run = Run(self.run_folder) if self.run_folder else newest_run()
         avatar, config, _ = load_checkpoint(run)
-        figures = evaluate(avatar, open_capture(config.capture))
+        figures = evaluate(avatar, capture_of(config))
         self.write_json(figures)
         write_worst(run.folder, figures["worst"])
         write_whole(run.figures, json.dumps(figures, indent=2) + "\n")
@@ -98,7 +98,7 @@ class Stress(Common):
 
     def run(self) -> None:
         """Run the battery on the held-out motion that is furthest from training; print each verdict."""
-        from dsar.data.capture import open_capture
+        from dsar.data.capture import capture_of
         from dsar.evaluation.report import write_report
         from dsar.evaluation.stress import CASES, stress
         from dsar.training.checkpoint import Run, load_checkpoint, newest_run, write_whole
@@ -106,7 +106,7 @@ class Stress(Common):
         self.check_device()
         run = Run(self.run_folder) if self.run_folder else newest_run()
         avatar, config, _ = load_checkpoint(run)
-        capture = open_capture(config.capture)
+        capture = capture_of(config)
         verdicts = stress(avatar, capture.motions[capture_sequence(capture, "test") or ""], CASES)
         found = {}
         for name, verdict in follow(verdicts, len(CASES), self.progress, "stress"):

@@ -33,7 +33,7 @@ def write_contact_sheet(folder: Path) -> Path:
 
     scene = _Scene(folder)
     last = len(scene.capture.motions[scene.far]) - 1
-    frames = [round(i * last / (_COLUMNS - 1)) for i in range(_COLUMNS)]
+    frames = sorted({round(i * last / (_COLUMNS - 1)) for i in range(_COLUMNS)})
     rows: dict[str, list] = {}
     for camera in scene.some_cameras():
         name = scene.capture.cameras[camera].name
@@ -91,11 +91,11 @@ class _Scene:
 
     def __init__(self, folder: Path) -> None:
         from dsar.avatar.rollout import START_FRAME
-        from dsar.data.capture import open_capture
+        from dsar.data.capture import capture_of
         from dsar.training.checkpoint import Run, load_checkpoint
 
         self.avatar, config, _ = load_checkpoint(Run(folder))
-        self.capture, self.first = open_capture(config.capture), START_FRAME
+        self.capture, self.first = capture_of(config), START_FRAME
         self.far = capture_sequence(self.capture, "test") or ""
 
     def some_cameras(self) -> list[int]:
@@ -104,9 +104,14 @@ class _Scene:
         return sorted({0, count // 3, 2 * count // 3})
 
     def truth(self, sequence: str, frame: int, camera: int) -> Any:
-        """Return a true image."""
+        """Return a true image; white where the camera has none."""
+        import numpy as np
+
         from dsar.evaluation.views import to_bytes, true_view
 
+        if camera not in self.capture.seen_by(sequence, frame):
+            view = self.capture.cameras[camera]
+            return np.full((view.height, view.width, 3), 255, np.uint8)
         return to_bytes(true_view(self.capture, sequence, frame, camera).color)
 
     def images(

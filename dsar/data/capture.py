@@ -1,29 +1,87 @@
-"""One door to captures of every format."""
+"""One door to captures of every format, which are told apart by what they hold."""
 
+from collections.abc import Callable
 from pathlib import Path
 
-from dsar.data.native import RECORD_NAME, NativeCapture, open_native
+from dsar.config import TrainConfig
+from dsar.data.avatarrex import PARAMETERS, open_actorshq, open_avatarrex, open_thuman4
+from dsar.data.dress import is_dress, open_dress
+from dsar.data.multiview import MultiViewCapture
+from dsar.data.native import RECORD_NAME, open_native
+from dsar.data.takes import Opening
 from dsar.errors import CaptureError
 
 EMBEDDED_CAPTURE = Path(__file__).parent / "embedded"
 """The simulated capture that comes with the package."""
 
 
-def open_capture(source: str | Path = "embedded") -> NativeCapture:
+def _open_native(root: Path, opening: Opening) -> MultiViewCapture:
+    return open_native(root, opening.body).with_frames(opening.train_frames, opening.test_frames)
+
+
+FORMATS: dict[str, tuple[Callable[[Path], bool], Callable[[Path, Opening], MultiViewCapture]]] = {
+    f"our own ({RECORD_NAME})": (
+        lambda root: (root / RECORD_NAME).is_file(),
+        _open_native,
+    ),
+    f"AvatarReX (calibration_full.json, {PARAMETERS})": (
+        lambda root: (root / "calibration_full.json").is_file(),
+        open_avatarrex,
+    ),
+    f"THuman4.0 (calibration.json, {PARAMETERS})": (
+        lambda root: (root / "calibration.json").is_file(),
+        open_thuman4,
+    ),
+    f"ActorsHQ (4x/calibration.csv, {PARAMETERS})": (
+        lambda root: any(root.glob("*x/calibration.csv")) or (root / "calibration.csv").is_file(),
+        open_actorshq,
+    ),
+    "4D-DRESS (Take*/basic_info.pkl, Capture/cameras.pkl)": (is_dress, open_dress),
+}
+"""What tells a format, and what reads it."""
+
+
+def open_capture(
+    source: str | Path = "embedded",
+    *,
+    body: str | Path | None = None,
+    train_frames: str | None = None,
+    test_frames: str | None = None,
+) -> MultiViewCapture:
     """Return a capture, checked for completeness.
 
     Args:
-        source: A capture folder, or `embedded` for the one that comes with the package.
+        source: A capture folder in any format of `FORMATS`, or `embedded` for the one that comes with the
+            package.
+        body: A body-model file instead of the capture's own, or a folder of SMPLX_<GENDER> files. Without
+            one, captures that bring none take $DSAR_BODY.
+        train_frames: Frames that train, such as 0-239: of a capture's single take, or of each training one.
+        test_frames: Frames that test, likewise.
 
     Raises:
         CaptureError: The folder is no capture, or something in it is missing or malformed.
+        MotionError: Its motion is.
+        BodyError: The body file is.
     """
     root = EMBEDDED_CAPTURE if source == "embedded" else Path(source)
     if not root.is_dir():
         raise CaptureError(f"capture {root}: no such folder; give a capture folder or `embedded`")
-    if not (root / RECORD_NAME).is_file():
-        raise CaptureError(
-            f"capture {root}: expected a {RECORD_NAME} (docs/capture-format.md describes it), found none; "
-            "give the folder that holds it"
-        )
-    return open_native(root)
+    opening = Opening(None if body is None else Path(body), train_frames, test_frames)
+    for is_format, open_format in FORMATS.values():
+        if is_format(root):
+            return open_format(root, opening)
+    raise CaptureError(
+        f"capture {root}: no format that we know: {'; '.join(FORMATS)}; give the folder that holds these "
+        "files (docs/capture-format.md)"
+    )
+
+
+def capture_of(config: TrainConfig) -> MultiViewCapture:
+    """Return the capture of a run, all cameras.
+
+    Raises:
+        DsarError: as `open_capture` does.
+    """
+    return open_capture(
+        config.capture, body=config.body, train_frames=config.train_frames, test_frames=config.test_frames
+    )

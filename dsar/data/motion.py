@@ -1,14 +1,11 @@
-"""Motion files: AMASS and SMPL-X .npz to our `Motion` and back, and changes of frame rate.
+"""Motion files: AMASS and SMPL-X .npz and .bvh to our `Motion`, .npz back, and changes of frame rate.
 
-The files have Z up and the axis-angles of SMPL-X, SMPL-H or SMPL; a `Motion` has Y up and SMPL-X's 55
+The .npz have Z up and the axis-angles of SMPL-X, SMPL-H or SMPL; a `Motion` has Y up and SMPL-X's 55
 joints. Their shape coefficients are not read: the avatar moves with its own shape.
 """
 
 import dataclasses
 import os
-import zipfile
-import zlib
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +13,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dsar.body.model import FACE_JOINTS, JOINT_NAMES, Body
+from dsar.body.model import Body
+from dsar.data.bvh import read_bvh
+from dsar.data.poses import read_arrays, read_poses, read_rate
 from dsar.errors import MotionError
 from dsar.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
 from dsar.types import Motion
@@ -25,59 +24,30 @@ EMBEDDED_MOTIONS = Path(__file__).parent / "embedded_motion"
 """Clips that come with the package, from the CMU motion capture database (mocap.cs.cmu.edu)."""
 
 _Y_UP_FROM_Z_UP = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
-_BODY_JOINTS, _HANDS = range(FACE_JOINTS.start), range(FACE_JOINTS.stop, len(JOINT_NAMES))
-# Joints that the columns of `poses` belong to, by their number: SMPL-X, SMPL-H, SMPL (whose last two
-# joints, the hands as lumps, SMPL-X has not), and SMPL-X's body alone.
-_JOINTS_OF_COLUMNS = {
-    165: [*range(len(JOINT_NAMES))],
-    156: [*_BODY_JOINTS, *_HANDS],
-    72: [*_BODY_JOINTS],
-    66: [*_BODY_JOINTS],
-}
-# Joints of the keys that stand for `poses` in files that split it; AMASS's names, then SMPL-X's.
-_JOINTS_OF_KEY = {
-    "root_orient": _BODY_JOINTS[:1],
-    "pose_body": _BODY_JOINTS[1:],
-    "pose_jaw": FACE_JOINTS[:1],
-    "pose_eye": FACE_JOINTS[1:],
-    "pose_hand": _HANDS,
-    "global_orient": _BODY_JOINTS[:1],
-    "body_pose": _BODY_JOINTS[1:],
-    "jaw_pose": FACE_JOINTS[:1],
-    "leye_pose": FACE_JOINTS[1:2],
-    "reye_pose": FACE_JOINTS[2:],
-    "left_hand_pose": _HANDS[:15],
-    "right_hand_pose": _HANDS[15:],
-}
-_ROOT_KEYS, _BODY_KEYS = ("root_orient", "global_orient"), ("pose_body", "body_pose")
-_TRANSLATION_KEYS = ("trans", "transl")
-_RATE_KEYS = ("mocap_frame_rate", "mocap_framerate", "fps")
 
 
 def read_motion(path: Path, body: Body) -> Motion:
-    """Return the motion of an AMASS or SMPL-X .npz file in the Y-up world, float32.
+    """Return the motion of a file in the Y-up world, float32.
 
     Joints that the file lacks stay at rest.
 
     Args:
-        path: a file with `poses` (or its parts), `trans` and a frame rate; Z up, radians, metres.
+        path: an AMASS or SMPL-X .npz with `poses` (or its parts), `trans` and a frame rate, Z up, radians,
+            metres; or a .bvh on CMU's skeleton (`dsar.data.bvh`).
         body: the body that will move: turning the world turns it about its pelvis.
 
     Raises:
         MotionError: the file is missing, unreadable, incomplete, empty or not finite.
     """
-    arrays = _read_arrays(path)
-    rotations = _read_rotations(path, arrays)
-    translations = arrays[_one_key(path, arrays, _TRANSLATION_KEYS)]
-    if translations.shape != (len(rotations), 3):
-        expected = (len(rotations), 3)
-        raise MotionError(f"motion file {path}: trans has shape {translations.shape}, expected {expected}")
-    rate = arrays[_one_key(path, arrays, _RATE_KEYS)]
-    if rate.size != 1 or not rate.item() > 0:
-        raise MotionError(f"motion file {path}: the frame rate is {rate}, expected one number above 0")
-    z_up = Motion(
-        torch.from_numpy(rotations).float(), torch.from_numpy(translations).float(), rate.item(), path.stem
-    )
+    if path.suffix == ".bvh":
+        return read_bvh(path, body)
+    if path.suffix != ".npz":
+        raise MotionError(
+            f"motion file {path}: expected an AMASS or SMPL-X .npz or a .bvh, found {path.suffix!r}"
+        )
+    arrays = read_arrays(path)
+    rotations, translations = read_poses(path, arrays)
+    z_up = Motion(rotations, translations, read_rate(path, arrays), path.stem)
     return turn_motion(z_up, body, torch.tensor(_Y_UP_FROM_Z_UP))
 
 
@@ -133,67 +103,3 @@ def resample(motion: Motion, fps: float) -> Motion:
     rotations = axis_angle_from_matrix(start @ matrix_from_axis_angle(change))
     translations = torch.lerp(motion.translations[before], motion.translations[after], part)
     return dataclasses.replace(motion, rotations=rotations, translations=translations, fps=fps)
-
-
-def _read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Return the arrays of a motion file that we use, as float64; the rest is not opened."""
-    if path.suffix != ".npz":
-        raise MotionError(f"motion file {path}: expected an AMASS or SMPL-X .npz, found {path.suffix!r}")
-    if not path.is_file():
-        raise MotionError(f"motion file {path}: no such file")
-    used = ("poses", *_JOINTS_OF_KEY, *_TRANSLATION_KEYS, *_RATE_KEYS)
-    try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-            arrays = {key: np.atleast_1d(file[key]).astype(np.float64) for key in used if key in file.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise MotionError(
-            f"motion file {path}: cannot be read ({error}); expected arrays of numbers"
-        ) from error
-    for key, array in arrays.items():
-        bad = np.argwhere(~np.isfinite(array))
-        if len(bad):
-            raise MotionError(
-                f"motion file {path}: {key} has {len(bad)} values that are not finite, first at "
-                f"frame {bad[0][0]}; cut those frames out"
-            )
-    return arrays
-
-
-def _read_rotations(path: Path, arrays: Mapping[str, np.ndarray]) -> Float[np.ndarray, "f 55 3"]:
-    """Return the rotations in SMPL-X's order, zero where the file has none."""
-    if "poses" in arrays:
-        poses = arrays["poses"]
-        if poses.ndim != 2 or poses.shape[1] not in _JOINTS_OF_COLUMNS:
-            raise MotionError(
-                f"motion file {path}: poses has shape {poses.shape}, expected (frames, "
-                f"{' | '.join(map(str, _JOINTS_OF_COLUMNS))}) of axis-angles"
-            )
-        joints = _JOINTS_OF_COLUMNS[poses.shape[1]]
-        parts = [("poses", joints, poses[:, : 3 * len(joints)])]
-    else:
-        for keys in (_ROOT_KEYS, _BODY_KEYS):
-            _one_key(path, arrays, keys, instead="poses")
-        parts = [(key, [*joints], arrays[key]) for key, joints in _JOINTS_OF_KEY.items() if key in arrays]
-    frames = min(len(values) for _, _, values in parts)
-    if frames == 0:
-        raise MotionError(f"motion file {path}: has no frames")
-    rotations = np.zeros((frames, len(JOINT_NAMES), 3))
-    for key, joints, values in parts:
-        found, expected = (len(values), values[0].size), (frames, 3 * len(joints))
-        if found != expected:
-            raise MotionError(
-                f"motion file {path}: {key} has {found} values, expected {expected} axis-angles"
-            )
-        rotations[:, joints] = values.reshape(frames, -1, 3)
-    return rotations
-
-
-def _one_key(path: Path, arrays: Mapping[str, np.ndarray], keys: tuple[str, ...], instead: str = "") -> str:
-    """Return the first of the keys that the file has, or raise."""
-    found = next((key for key in keys if key in arrays), None)
-    if found is None:
-        wanted = " or ".join((*keys, instead) if instead else keys)
-        raise MotionError(
-            f"motion file {path}: lacks {wanted}; it has {', '.join(arrays) or 'nothing we know'}"
-        )
-    return found

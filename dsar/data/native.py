@@ -1,225 +1,115 @@
 """Captures in our own format: a folder with a capture.json (docs/capture-format.md)."""
 
-import dataclasses
 import io
 import json
+import logging
 import zipfile
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cache
+import zlib
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import UInt8
 from PIL import Image, UnidentifiedImageError
-from torch import Tensor
 
 from dsar.body.files import load_body
 from dsar.body.model import Body
+from dsar.data.calibration import make_camera
+from dsar.data.images import decode_rgba
 from dsar.data.motion import read_motion
-from dsar.errors import CaptureError, ConfigError
-from dsar.geometry.cameras import spread_out
+from dsar.data.multiview import MultiViewCapture, OneToMany
+from dsar.errors import CaptureError
 from dsar.types import Camera, Motion
 
 RECORD_NAME = "capture.json"
 FORMAT, VERSION = "dsar-capture", 1
 _SUFFIXES = (".webp", ".png")
-_RIGID_TOLERANCE = 1e-4
 T = TypeVar("T")
+LOGGER = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class OneToMany:
-    """Frames of one sequence in which the body's pose is the same and the cloth is not; ends included."""
+class _Images:
+    """Images of one sequence, in a folder or a zip, as CAMERA/FRAME.webp or .png; implements `Views`."""
 
-    sequence: str
-    after_stop: tuple[int, int]
-    at_rest: tuple[int, int]
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        # A zip stays open and its images are read one by one: all of them may not fit in memory.
+        self.archive = None if path.is_dir() else _open_archive(path)
+        names = self.archive.namelist() if self.archive else map(self._relative, path.glob("*/*"))
+        self.names = frozenset(names)
 
-
-@dataclass(frozen=True)
-class NativeCapture:
-    """A capture in our own format; implements `dsar.types.Capture`.
-
-    Images are held compressed and decoded on demand. Pickling sends only the folder's path: the other
-    process opens the capture anew.
-    """
-
-    root: Path
-    """The capture's folder."""
-    name: str
-    """Label of the capture."""
-    fps: float
-    """Frames per second of every sequence."""
-    cameras: Sequence[Camera]
-    """Calibrated cameras, the same for every frame."""
-    body: Body
-    """The person at rest, in the capture's shape."""
-    body_path: Path | None
-    """The body-model file; None is the embedded body."""
-    betas: Float[Tensor, " s"]
-    """Shape coefficients of the body."""
-    motions: Mapping[str, Motion]
-    """Body motion of each sequence, by sequence name, in the order of the file."""
-    splits: Mapping[str, Sequence[str]]
-    """Sequence names of `train` and `test` and of each label such as `nd`, `fd`."""
-    one_to_many: Sequence[OneToMany]
-    """Where equal poses with different cloth are to be found."""
-    _images: Mapping[str, "_ImageSource"] = field(repr=False)
-    _garments: Mapping[str, Path] = field(repr=False)
-
-    def __reduce__(self) -> tuple[Callable[..., "NativeCapture"], tuple[Path, tuple[str, ...]]]:
-        return _reopen, (self.root, tuple(camera.name for camera in self.cameras))
-
-    def with_cameras(self, count: int | None) -> "NativeCapture":
-        """Return the capture as seen by some of its cameras, spread as far as can be; None: by all."""
-        if count is None:
-            return self
-        if not 1 <= count <= len(self.cameras):
-            raise ConfigError(f"cameras is {count}; capture {self.name} has {len(self.cameras)}")
-        return dataclasses.replace(self, cameras=spread_out(self.cameras, count))
-
-    def image(self, sequence: str, frame: int, camera: int) -> UInt8[np.ndarray, "h w 4"]:
-        """Return one image: straight (not premultiplied) sRGB and coverage as alpha.
-
-        Raises:
-            CaptureError: There is no such image, or it cannot be decoded or has the wrong size.
-        """
-        if sequence not in self.motions:
-            raise CaptureError(
-                f"capture {self.name}: no sequence {sequence!r}; there are {', '.join(self.motions)}"
-            )
-        view, frames = self.cameras[camera], len(self.motions[sequence])
-        if not 0 <= frame < frames:
-            raise CaptureError(
-                f"capture {self.name}, {sequence}: no frame {frame}; there are 0 to {frames - 1}"
-            )
-        return self._images[sequence].read(view, frame)
-
-    def garment(self, sequence: str, run: int = 0) -> Float[np.ndarray, "f v 3"]:
-        """Return the simulated garment's true vertices, world metres.
-
-        Args:
-            sequence: Name of a sequence with garment truth.
-            run: 0 is the run in the images; higher ones are other true outcomes of the same motion, begun
-                from a slightly different state.
-
-        Raises:
-            CaptureError: The capture has no such truth.
-        """
-        steps = self._read_garment(sequence, f"run{run}")
-        unit = self._read_garment(sequence, "unit")
-        return (np.cumsum(steps.astype(np.int32), 0) * float(unit)).astype(np.float32)
-
-    def garment_runs(self, sequence: str) -> int:
-        """Return how many true outcomes of a sequence `garment` knows; 0 without garment truth."""
-        path = self._garments.get(sequence)
-        if path is None:
-            return 0
-        with np.load(path) as file:
-            return sum(key.startswith("run") for key in file.files)
-
-    def garment_faces(self, sequence: str) -> Int[np.ndarray, "t 3"]:
-        """Return the triangles of the garment's vertices, counter-clockwise seen from outside."""
-        return self._read_garment(sequence, "faces").astype(np.int64)
-
-    def _read_garment(self, sequence: str, key: str) -> np.ndarray:
-        path = self._garments.get(sequence)
-        if path is None:
-            known = ", ".join(self._garments) or "none"
-            raise CaptureError(f"capture {self.name}: no garment truth for {sequence!r}; it has {known}")
-        with np.load(path) as file:
-            if key not in file.files:
-                raise CaptureError(f"garment {path}: expected {key}, found {', '.join(file.files)}")
-            return file[key]
-
-
-@dataclass(frozen=True)
-class _ImageSource:
-    """Images of one sequence, in a folder or a zip, as CAMERA/FRAME.webp or .png."""
-
-    path: Path
+    def has(self, camera: Camera, frame: int) -> bool:
+        """Return whether there is such an image."""
+        return self._find(camera, frame) is not None
 
     def read(self, camera: Camera, frame: int) -> UInt8[np.ndarray, "h w 4"]:
         """Return a decoded image, or raise CaptureError."""
-        entries = _read_entries(self.path)
-        entry = self.find(entries, camera, frame)
-        if entry is None:
+        name = self._find(camera, frame)
+        if name is None:
             raise CaptureError(f"images {self.path}: no {camera.name}/{frame:04d}.webp or .png")
-        try:
-            image = np.asarray(Image.open(io.BytesIO(entries[entry])))
-        except (OSError, UnidentifiedImageError) as error:
-            raise CaptureError(f"image {entry} in {self.path}: cannot be decoded ({error})") from error
-        expected = (camera.height, camera.width, 4)
-        if image.shape != expected or image.dtype != np.uint8:
-            raise CaptureError(
-                f"image {entry} in {self.path}: expected 8-bit RGBA of {camera.width}x{camera.height}, found "
-                f"shape {image.shape} of {image.dtype}; the mask belongs into the alpha channel"
-            )
-        return image
-
-    @staticmethod
-    def find(entries: Mapping[str, bytes] | set[str], camera: Camera, frame: int) -> str | None:
-        """Return the name of an image among entries, or None."""
-        names = (f"{camera.name}/{frame:04d}{suffix}" for suffix in _SUFFIXES)
-        return next((name for name in names if name in entries), None)
+        return decode_rgba(self._load(name), camera, f"{name} in {self.path}")
 
     def check(self, cameras: Sequence[Camera], frames: int) -> None:
-        """Raise CaptureError unless every camera has every frame and the first has the right size."""
-        names = _list_entries(self.path)
+        """Raise CaptureError unless every camera has images, and the first of them the right size."""
         for camera in cameras:
-            missing = [frame for frame in range(frames) if self.find(names, camera, frame) is None]
-            if missing:
+            there = [frame for frame in range(frames) if self.has(camera, frame)]
+            if not there:
                 raise CaptureError(
-                    f"images {self.path}: {camera.name} lacks {len(missing)} of {frames} frames, the first "
-                    f"is {camera.name}/{missing[0]:04d}.webp or .png; add them or lower `frames`"
+                    f"images {self.path}: {camera.name} has none of {frames} frames; expected "
+                    f"{camera.name}/0000.webp or .png and so on; add them, or take the camera out of "
+                    f"{RECORD_NAME}"
                 )
-            self._check_size(camera, str(self.find(names, camera, 0)))
+            if len(there) < frames:
+                gap = min(set(range(frames)) - set(there))
+                LOGGER.warning(
+                    "Images %s: %s lacks %d of %d frames, the first is %d; it does without them",
+                    *(self.path, camera.name, frames - len(there), frames, gap),
+                )
+            self._check_size(camera, str(self._find(camera, there[0])))
 
-    def _check_size(self, camera: Camera, entry: str) -> None:
+    def _find(self, camera: Camera, frame: int) -> str | None:
+        names = (f"{camera.name}/{frame:04d}{suffix}" for suffix in _SUFFIXES)
+        return next((name for name in names if name in self.names), None)
+
+    def _load(self, name: str) -> bytes:
+        try:
+            return self.archive.read(name) if self.archive else (self.path / name).read_bytes()
+        except (OSError, zipfile.BadZipFile, zlib.error) as error:
+            raise CaptureError(f"image {name} in {self.path}: cannot be read ({error})") from error
+
+    def _relative(self, path: Path) -> str:
+        return path.relative_to(self.path).as_posix()
+
+    def _check_size(self, camera: Camera, name: str) -> None:
         """Read no more of an image than its header."""
         try:
-            with Image.open(io.BytesIO(_read_entry(self.path, entry))) as image:
+            with Image.open(io.BytesIO(self._load(name))) as image:
                 size, mode = image.size, image.mode
         except (OSError, UnidentifiedImageError) as error:
-            raise CaptureError(f"image {entry} in {self.path}: cannot be decoded ({error})") from error
+            raise CaptureError(f"image {name} in {self.path}: cannot be decoded ({error})") from error
         if size != (camera.width, camera.height) or mode != "RGBA":
             raise CaptureError(
-                f"image {entry} in {self.path}: expected RGBA of {camera.width}x{camera.height} as "
+                f"image {name} in {self.path}: expected RGBA of {camera.width}x{camera.height} as "
                 f"{camera.name} in {RECORD_NAME}, found {mode} of {size[0]}x{size[1]}"
             )
 
 
-def _list_entries(path: Path) -> set[str]:
-    if path.is_dir():
-        return {item.relative_to(path).as_posix() for item in path.glob("*/*")}
+def _open_archive(path: Path) -> zipfile.ZipFile:
     try:
-        with zipfile.ZipFile(path) as archive:
-            return set(archive.namelist())
+        return zipfile.ZipFile(path)
     except (OSError, zipfile.BadZipFile) as error:
         raise CaptureError(f"images {path}: expected a folder or a zip file ({error})") from error
 
 
-def _read_entry(path: Path, entry: str) -> bytes:
-    if path.is_dir():
-        return (path / entry).read_bytes()
-    with zipfile.ZipFile(path) as archive:
-        return archive.read(entry)
-
-
-@cache
-def _read_entries(path: Path) -> Mapping[str, bytes]:
-    """Return all compressed images of a sequence; they stay in memory for the process's life."""
-    if path.is_dir():
-        return {item.relative_to(path).as_posix(): item.read_bytes() for item in path.glob("*/*")}
-    with zipfile.ZipFile(path) as archive:
-        return {name: archive.read(name) for name in archive.namelist()}
-
-
-def open_native(root: Path) -> NativeCapture:
+def open_native(root: Path, body: Path | None = None) -> MultiViewCapture:
     """Return the capture in a folder, checked for completeness.
+
+    Args:
+        root: The folder with its capture.json.
+        body: A body-model file instead of the capture's own.
 
     Raises:
         CaptureError: Something is missing or malformed; the message names it.
@@ -241,35 +131,28 @@ def open_native(root: Path) -> NativeCapture:
     pairs = tuple(_read_pair(entry, sequences, where) for entry in record.get("one_to_many", []))
     images = {}
     for name, entry in sequences.items():
-        images[name] = _ImageSource(root / _get(entry, "images", str, f"{where}, sequence {name}"))
+        images[name] = _Images(root / _get(entry, "images", str, f"{where}, sequence {name}"))
         images[name].check(cameras, _get(entry, "frames", int, f"{where}, sequence {name}"))
-    body_path = root / record["body"] if record.get("body") else None
+    body_path = body or (root / record["body"] if record.get("body") else None)
     betas = torch.tensor(_get(record, "betas", list, where), dtype=torch.float32)
-    body = load_body(body_path, betas if len(betas) else None)
-    return NativeCapture(
+    shaped = load_body(body_path, betas if len(betas) else None)
+    return MultiViewCapture(
         root=root,
         name=_get(record, "name", str, where),
         fps=fps,
         cameras=tuple(cameras),
-        body=body,
+        body=shaped,
         body_path=body_path,
         betas=betas,
         motions={
-            name: _read_sequence_motion(root, name, entry, body, fps) for name, entry in sequences.items()
+            name: _read_sequence_motion(root, name, entry, shaped, fps) for name, entry in sequences.items()
         },
         splits=splits,
         one_to_many=pairs,
-        _images=images,
-        _garments={
-            name: root / entry["garment"] for name, entry in sequences.items() if entry.get("garment")
-        },
+        views=images,
+        reopen=partial(open_native, root, body),
+        garments={name: root / entry["garment"] for name, entry in sequences.items() if entry.get("garment")},
     )
-
-
-def _reopen(root: Path, cameras: tuple[str, ...]) -> NativeCapture:
-    """Return a capture as seen by the cameras of these names."""
-    capture = open_native(root)
-    return dataclasses.replace(capture, cameras=[c for c in capture.cameras if c.name in cameras])
 
 
 def _read_record(where: Path) -> dict[str, Any]:
@@ -299,33 +182,9 @@ def _read_camera(entry: Mapping[str, Any], where: str) -> Camera:
     name = _get(entry, "name", str, where)
     if not name.isidentifier():
         raise CaptureError(f"{where}: expected a name of letters, digits and _, found {name!r}")
-    K = _read_matrix(entry, "K", 3, where)
-    if not (K[0, 0] > 0 and K[1, 1] > 0 and torch.equal(K[2], torch.tensor([0.0, 0.0, 1.0]))):
-        raise CaptureError(
-            f"{where} {name}: expected K as [[fx, s, cx], [0, fy, cy], [0, 0, 1]], found {K.tolist()}"
-        )
-    transform = _read_matrix(entry, "T_camera_world", 4, where)
-    rotation = transform[:3, :3].double()
-    error = float((rotation @ rotation.T - torch.eye(3).double()).abs().max())
-    last = torch.equal(transform[3], torch.tensor([0.0, 0.0, 0.0, 1.0]))
-    if error > _RIGID_TOLERANCE or torch.linalg.det(rotation) < 0 or not last:
-        raise CaptureError(
-            f"{where} {name}: T_camera_world is not rigid (rows off orthonormal by {error:.1e}, "
-            f"determinant {float(torch.linalg.det(rotation)):.3f}); expected a rotation, a translation and "
-            "a last row 0 0 0 1"
-        )
-    return Camera(K, transform, _get(entry, "width", int, where), _get(entry, "height", int, where), name)
-
-
-def _read_matrix(entry: Mapping[str, Any], key: str, size: int, where: str) -> Float[Tensor, "n n"]:
-    value = _get(entry, key, list, where)
-    try:
-        matrix = torch.tensor(value, dtype=torch.float32)
-    except (TypeError, ValueError) as error:
-        raise CaptureError(f"{where}: {key} is not a {size}x{size} matrix of numbers ({error})") from error
-    if matrix.shape != (size, size) or not bool(matrix.isfinite().all()):
-        raise CaptureError(f"{where}: {key} is not a {size}x{size} matrix of finite numbers, found {value}")
-    return matrix
+    matrices = {key: _get(entry, key, list, where) for key in ("K", "T_camera_world")}
+    size = _get(entry, "width", int, where), _get(entry, "height", int, where)
+    return make_camera(f"{where} {name}", name, matrices["K"], matrices["T_camera_world"], size)
 
 
 def _read_sequence_motion(root: Path, name: str, entry: Mapping[str, Any], body: Body, fps: float) -> Motion:

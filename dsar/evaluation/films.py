@@ -32,6 +32,12 @@ def record(
     return np.stack(made), np.stack(true)
 
 
+def whole_films(capture: Capture, sequence: str) -> list[int]:
+    """Return the cameras that lack no frame of a sequence."""
+    seen = (set(capture.seen_by(sequence, frame)) for frame in range(len(capture.motions[sequence])))
+    return sorted(set.intersection(*seen))
+
+
 def evaluate_films(
     avatar: Avatar,
     capture: Capture,
@@ -44,7 +50,7 @@ def evaluate_films(
     features: dict[tuple[str, str], list[tuple[Tensor, Tensor]]] = defaultdict(list)
     for sequence in {name: None for names in splits.values() for name in names}:
         # One camera's films in memory at a time: a real capture's would fill it.
-        for camera in range(len(capture.cameras)):
+        for camera in whole_films(capture, sequence):
             made, true = record(avatar, capture, sequence, camera, streams)
             if "vmaf" not in skipped:
                 scores[sequence].append(vmaf(made, true))

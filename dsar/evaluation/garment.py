@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dsar.avatar.avatar import Avatar
 from dsar.avatar.rollout import roll_out, template_sequence
-from dsar.data.native import NativeCapture
+from dsar.data.multiview import MultiViewCapture
 from dsar.geometry.cameras import project
 from dsar.types import Camera
 
@@ -109,7 +109,7 @@ def garment_mask(
 
 @torch.no_grad()
 def measure_garment(
-    avatar: Avatar, capture: NativeCapture, sequence: str, stride: int
+    avatar: Avatar, capture: MultiViewCapture, sequence: str, stride: int
 ) -> dict[str, dict[str, float]] | None:
     """Return the garment's figures on every `stride`-th frame, metres; None without truth or a chart.
 

@@ -16,8 +16,8 @@ from torch import Tensor
 
 from dsar.avatar.avatar import Avatar
 from dsar.avatar.rollout import START_FRAME, roll_out
-from dsar.data.native import NativeCapture
-from dsar.evaluation.divergence import median_distance, mmd, pose_features
+from dsar.data.divergence import divergence
+from dsar.data.multiview import MultiViewCapture
 from dsar.evaluation.films import FILM_METRICS, evaluate_films
 from dsar.evaluation.garment import garment_mask, measure_garment
 from dsar.evaluation.metrics import ImageMetric, correlation, load_perceptual, psnr
@@ -74,8 +74,8 @@ def evaluate_sequence(
         frame = number - START_FRAME
         if frame % stride == 0:
             template = avatar.gaussians(track[[frame]], None)[0]
-            for index, camera in enumerate(capture.cameras):
-                truth = true_view(capture, sequence, frame, index)
+            for index in capture.seen_by(sequence, frame):
+                camera, truth = capture.cameras[index], true_view(capture, sequence, frame, index)
                 image = render_white(gaussians, camera)
                 row: dict[str, float | int] = {"frame": frame, "camera": index}
                 row |= compare(image, render_white(template, camera), truth)
@@ -83,7 +83,8 @@ def evaluate_sequence(
                     dressed = garment_mask(cloth[0][frame], cloth[1], camera) & (truth.mask > 0.5)
                     if dressed.any():
                         row["psnr_garment"] = psnr(image[dressed][None], truth.color[dressed][None])
-                if frame % (_SELDOM * stride) == 0 and before is not None:
+                seldom = frame % (_SELDOM * stride) == 0
+                if seldom and before is not None and index in capture.seen_by(sequence, frame - 1):
                     last = true_view(capture, sequence, frame - 1, index)
                     row |= compare_change((before, gaussians), camera, (last, truth), perceptual)
                     # The first frame has none before it.
@@ -97,7 +98,7 @@ def evaluate_sequence(
 
 def true_garment(capture: Capture, sequence: str) -> tuple[Tensor, Tensor] | None:
     """Return the garment's true vertices [f,v,3] and triangles [t,3]; None where the capture has none."""
-    if not (isinstance(capture, NativeCapture) and capture.garment_runs(sequence)):
+    if not (isinstance(capture, MultiViewCapture) and capture.garment_runs(sequence)):
         return None
     return torch.from_numpy(capture.garment(sequence)), torch.from_numpy(capture.garment_faces(sequence))
 
@@ -136,7 +137,7 @@ def compare_change(
 
 @torch.no_grad()
 def one_to_many(
-    avatar: Avatar, capture: NativeCapture, *, streams: Collection[Stream] = STREAMS
+    avatar: Avatar, capture: MultiViewCapture, *, streams: Collection[Stream] = STREAMS
 ) -> dict[str, float] | None:
     """Return correlation and size ratio of predicted against true difference at one pose with two pasts.
 
@@ -200,7 +201,7 @@ def time_rollout(
 
 
 def evaluate(
-    avatar: Avatar, capture: NativeCapture, *, stride: int = 2, streams: Collection[Stream] = STREAMS
+    avatar: Avatar, capture: MultiViewCapture, *, stride: int = 2, streams: Collection[Stream] = STREAMS
 ) -> dict[str, Any]:
     """Return the held-out figures of a run in the shape of the command-line contract.
 
@@ -233,7 +234,9 @@ def evaluate(
         names = [name for name in capture.splits.get(split, ()) if name in by_sequence]
         rows = summarize(by_sequence, names, len(capture.cameras)) if names else None
         if rows:
-            rows["mmd"] = divergence(capture, names) if split != "train" else 0.0
+            rows["mmd"] = (
+                divergence(capture.motions, capture.splits["train"], names) if split != "train" else 0.0
+            )
         splits[split] = rows and rows | dict.fromkeys(FILM_METRICS) | films.get(split, {})
     garments = {name: measure_garment(avatar, capture, name, 2 * stride) for name in capture.splits["test"]}
     if not all(true_garment(capture, name) for name in by_sequence):
@@ -253,15 +256,6 @@ def evaluate(
         "worst": worst_views(by_sequence, capture.splits["test"]),
         "skipped": skipped,
     }
-
-
-def divergence(capture: Capture, names: Sequence[str]) -> float:
-    """Return how far the poses of some sequences are from those of training."""
-    known, new = (
-        torch.cat([pose_features(capture.motions[name]) for name in group])
-        for group in (capture.splits["train"], names)
-    )
-    return mmd(known, new, median_distance(known))
 
 
 def worst_views(

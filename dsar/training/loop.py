@@ -15,9 +15,9 @@ from torch import nn
 
 from dsar.avatar.avatar import Avatar
 from dsar.avatar.stillness import stillest_frames
-from dsar.body.files import load_body
 from dsar.config import TrainConfig, config_from_json, config_to_json
-from dsar.data.capture import open_capture
+from dsar.data.capture import capture_of
+from dsar.data.multiview import MultiViewCapture
 from dsar.errors import CaptureError, CheckpointError, ConfigError, TrainingError
 from dsar.training import checkpoint as ckpt
 from dsar.training import workers
@@ -50,9 +50,12 @@ def train(config: TrainConfig, run: Run, *, resume: bool = False, report: Report
             TrainingError when a value stops being finite.
     """
     config.validate()
-    cameras = open_capture(config.capture).with_cameras(config.cameras).cameras
-    if config.schedule.views > len(cameras):
-        raise ConfigError(f"schedule.views is {config.schedule.views}; there are {len(cameras)} cameras")
+    capture = capture_of(config).with_cameras(config.cameras)
+    if config.schedule.views > len(capture.cameras):
+        raise ConfigError(
+            f"schedule.views is {config.schedule.views}; there are {len(capture.cameras)} cameras"
+        )
+    config = with_body(config, capture)
     if run.exists and not resume:
         raise CheckpointError(f"{run.folder} holds a run already; go on with --resume, or give another --out")
     if resume and not run.exists:
@@ -65,6 +68,14 @@ def train(config: TrainConfig, run: Run, *, resume: bool = False, report: Report
     run.config.write_text(config_to_json(config))
     workers.run_workers(config.workers, _train, (config, run.folder, resume), report)
     return run
+
+
+def with_body(config: TrainConfig, capture: MultiViewCapture) -> TrainConfig:
+    """Return the settings with the body file that came from the environment written down."""
+    path = capture.body_path
+    if config.body is not None or path is None or path.is_relative_to(capture.root):
+        return config
+    return dataclasses.replace(config, body=str(path.resolve()))
 
 
 def check_same_settings(config: TrainConfig, saved: TrainConfig, run: Run) -> None:
@@ -83,14 +94,13 @@ def check_same_settings(config: TrainConfig, saved: TrainConfig, run: Run) -> No
 def _train(config: TrainConfig, folder: Path, resume: bool, report: Reporter | None) -> None:
     torch.manual_seed(config.seed)
     run = Run(folder)
-    capture = open_capture(config.capture).with_cameras(config.cameras)
+    capture = capture_of(config).with_cameras(config.cameras)
     if resume:
         avatar, _, _ = ckpt.load_checkpoint(run)
     else:
-        body = load_body(Path(config.body), capture.betas) if config.body else capture.body
-        avatar = Avatar.from_capture(capture, body, config.atlas, config.model)
+        avatar = Avatar.from_capture(capture, capture.body, config.atlas, config.model)
     lpips = load_lpips("alex") if config.loss.lpips else None
-    trainer = SegmentTrainer(config, capture, avatar.train(), training_clips(config, capture), lpips)
+    trainer = SegmentTrainer(config, capture, avatar.train(), training_clips(capture), lpips)
     rest = RestShapes(avatar, still_frames(trainer, avatar.fps))
     registration = Registration(config, capture, avatar, rest, trainer.tracks, trainer.streams.clips)
     schedule = registration.reduced(config.schedule)
@@ -184,34 +194,15 @@ def _segment(
         raise TrainingError(f"step {step} ({now.stage}): {error}") from error
 
 
-def training_clips(config: TrainConfig, capture: Capture) -> dict[str, range]:
-    """Return the frames of each training sequence that the settings allow.
+def training_clips(capture: Capture) -> dict[str, range]:
+    """Return the frames of each training sequence.
 
     Raises:
-        CaptureError: none are left.
+        CaptureError: there are none.
     """
-    clips = select_frames(capture, "train", config.train_frames)
+    clips = {name: range(len(capture.motions[name])) for name in capture.splits["train"]}
     if not clips:
-        raise CaptureError(
-            f"capture {capture.name}: no training frames in {config.train_frames or 'any sequence'}"
-        )
-    return clips
-
-
-def select_frames(capture: Capture, split: str, frames: str | None) -> dict[str, range]:
-    """Return, by sequence of a split, the frames inside a contiguous range such as 0-239 (None: all)."""
-    low, high = 0, None
-    if frames is not None:
-        first, _, last = frames.partition("-")
-        if not (first.isdigit() and (last or first).isdigit()):
-            raise ConfigError(f"frame range {frames!r} is not of the form 0-239")
-        low, high = int(first), int(last or first) + 1
-    clips = {}
-    for name in capture.splits[split]:
-        length = len(capture.motions[name])
-        clip = range(low, min(length, high if high is not None else length))
-        if len(clip):
-            clips[name] = clip
+        raise CaptureError(f"capture {capture.name}: no sequence of it is for training")
     return clips
 
 

@@ -128,17 +128,21 @@ class Registration:
         self.count += 1
         return self.fit(*place) if place is not None else None
 
-    def fit(self, name: str, frame: int) -> Progress:
-        """Fit the map of a frame; those of the frames before it are fitted."""
+    def fit(self, name: str, frame: int) -> Progress | None:
+        """Fit the map of a frame; those of the frames before it are fitted. What no camera saw is guessed."""
         rng = np.random.default_rng([self.seed, self.order.index(name), frame])
         context = self.tracks[name][[frame]]
         guesses, fast = self._guesses(context, name, frame)
         points = self._posed(context, guesses[0])
         view = functools.cache(functools.partial(self._view, name, frame, points=points))
-        cameras = len(self.capture.cameras)
+        cameras = self.capture.seen_by(name, frame)
+        if not cameras:
+            self.offsets[name][frame, self.garment] = guesses[0]
+            self.fitted[name] += 1
+            return None
 
         def some_views() -> list[tuple[Target, float]]:
-            count = min(FAST_VIEWS if fast else VIEWS, cameras)
+            count = min(FAST_VIEWS if fast else VIEWS, len(cameras))
             return [view(int(k)) for k in rng.choice(cameras, count, replace=False)]
 
         guess = self._best(context, guesses, some_views())

@@ -3,6 +3,7 @@
 import dataclasses
 from collections import defaultdict, deque
 from collections.abc import Collection, Mapping
+from concurrent.futures import Future
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +22,7 @@ from dsar.training.losses import TemporalRecord, image_loss, registered_loss, sp
 from dsar.training.rest import RestShapes
 from dsar.training.stages import WHOLE_CLIP, Position
 from dsar.training.streams import Place, Streams
-from dsar.training.targets import load_target
+from dsar.training.targets import Target, TargetLoader
 from dsar.types import Capture, Gaussians
 
 TEMPLATE_FRAMES = 8
@@ -70,7 +71,8 @@ class SegmentTrainer:
         clips: dict[str, range],
         lpips: nn.Module | None,
     ) -> None:
-        self.config, self.capture, self.avatar, self.lpips = config, capture, avatar, lpips
+        self.config, self.avatar, self.lpips = config, avatar, lpips
+        self.loader = TargetLoader(capture)
         self.tracks = {name: avatar.track(capture.motions[name]) for name in clips}
         self.streams = Streams(clips, config.schedule.streams, config.schedule.mirrored)
         self.mirror = (
@@ -87,13 +89,15 @@ class SegmentTrainer:
 
     def template_segment(self, rng: np.random.Generator, rest: RestShapes, reduction: int) -> Progress:
         """Back-propagate views of the template in the shapes it has in still frames."""
-        count = TEMPLATE_FRAMES * self.config.schedule.views
+        chosen, views = rng.choice(len(rest.frames), TEMPLATE_FRAMES), self.config.schedule.views
+        places = [rest.frames[index] for index in chosen]
+        targets = [self.loader.ask(rng, name, frame, reduction, views) for name, frame in places]
+        count = max(sum(map(len, targets)), 1)
         loss, mse = count * rest.loss(self.avatar, self.config.loss), torch.zeros(())
-        for index in rng.choice(len(rest.frames), TEMPLATE_FRAMES):
-            name, frame = rest.frames[index]
+        for index, (name, frame), some in zip(chosen, places, targets, strict=True):
             output = rest.output(self.avatar, int(index))
             gaussians = self.avatar.gaussians(self.tracks[name][[frame]], output)[0]
-            view = self._views(rng, gaussians, name, frame, reduction)
+            view = self._views(rng, gaussians, some, reduction)
             loss, mse = loss + view[0], mse + view[1]
         return self._finish(loss, mse, count)
 
@@ -102,7 +106,7 @@ class SegmentTrainer:
         self.avatar.reveal()
         loss = torch.zeros(())
         for _ in range(self.config.schedule.segment):
-            step = self._step(rng, WHOLE_CLIP, streams=STREAMS)
+            step = self._step(*self.streams.next_frames(rng, WHOLE_CLIP), streams=STREAMS)
             loss = loss + self._registered(step)
         self._cut()
         return self._finish(loss, None, self.config.schedule.segment)
@@ -118,29 +122,33 @@ class SegmentTrainer:
         losses: dict[str, Tensor] = defaultdict(lambda: torch.zeros(()))
         mse, count = torch.zeros(()), 0
         for _ in range(schedule.segment):
-            step = self._step(rng, position.horizon, streams=streams)
-            shown = [i for i in range(len(step.places)) if rng.random() < schedule.rendered]
+            places, fresh = self.streams.next_frames(rng, position.horizon)
+            shown = [i for i in range(len(places)) if rng.random() < schedule.rendered]
+            targets = [
+                self.loader.ask(rng, places[i].sequence, places[i].frame, position.reduction, schedule.views)
+                for i in shown
+            ]
+            step = self._step(places, fresh, streams=streams)
             answers = step.answer.select(shown)
             gaussians = self.avatar.gaussians(step.context[shown], answers) if shown else []
-            for place, each in zip((step.places[i] for i in shown), gaussians, strict=True):
-                view = self._views(rng, each, place.sequence, place.frame, position.reduction)
+            for each, some in zip(gaussians, targets, strict=True):
+                view = self._views(rng, each, some, position.reduction)
                 losses["render"] = losses["render"] + view[0]
-                mse, count = mse + view[1], count + schedule.views
+                mse, count = mse + view[1], count + len(some)
             regularisers = {"spatial": self._spatial(step.output)}
             if self.registered:
                 regularisers["registered"] = self.config.loss.registered * self._registered(step)
             if streams:
                 regularisers |= self._temporal(step)
             for name, loss in regularisers.items():
-                losses[name] = losses[name] + loss * len(shown) * schedule.views
+                losses[name] = losses[name] + loss * sum(map(len, targets))
         self._cut()
         gradients = self._compare_gradients(losses) if probe else None
         done = self._finish(torch.stack(list(losses.values())).sum(), mse, max(count, 1))
         return dataclasses.replace(done, gradients=gradients)
 
-    def _step(self, rng: np.random.Generator, horizon: int, *, streams: Collection[Stream]) -> "_Step":
-        """Advance every rollout by one frame."""
-        places, fresh = self.streams.next_frames(rng, horizon)
+    def _step(self, places: list[Place], fresh: list[bool], *, streams: Collection[Stream]) -> "_Step":
+        """Advance every rollout by one frame, some of them afresh."""
         self.state = self.state.restart(torch.tensor(fresh))
         seen = context = torch.stack([self.tracks[p.sequence][p.frame] for p in places])
         mirrored = torch.tensor([place.mirrored for place in places])
@@ -194,12 +202,11 @@ class SegmentTrainer:
             self.streams.streams[:] = [Place(**place) for place in places]  # pyright: ignore[reportArgumentType]
 
     def _views(
-        self, rng: np.random.Generator, gaussians: Gaussians, sequence: str, frame: int, reduction: int
+        self, rng: np.random.Generator, gaussians: Gaussians, targets: list[Future[Target]], reduction: int
     ) -> tuple[Tensor, Tensor]:
-        """Return summed loss and squared error of random cameras on a random background."""
+        """Return summed loss and squared error of some views on a random background."""
         loss, mse = torch.zeros(()), torch.zeros(())
-        for index in rng.choice(len(self.capture.cameras), self.config.schedule.views, replace=False):
-            target = load_target(self.capture, sequence, frame, int(index), reduction)
+        for target in (each.result() for each in targets):
             background = torch.from_numpy(rng.random(3, np.float32))
             output = rasterize(
                 gaussians, target.camera, background=background, dilation=reduced_dilation(reduction)

@@ -1,6 +1,7 @@
 """The images that training compares with: decoded, premultiplied, reduced and cropped to the person."""
 
 import dataclasses
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,6 +43,25 @@ def load_target(capture: Capture, sequence: str, frame: int, camera_index: int, 
     color, alpha = _premultiplied_means(pixels, x0, y0, x1, y1, reduction)
     camera = camera.cropped(x0, y0, x1 - x0, y1 - y0)
     return Target(torch.from_numpy(color), torch.from_numpy(alpha), camera)
+
+
+class TargetLoader:
+    """Loads views in a thread of its own, while the network computes."""
+
+    def __init__(self, capture: Capture) -> None:
+        self.capture = capture
+        self._thread = ThreadPoolExecutor(1, "targets")
+
+    def ask(
+        self, rng: np.random.Generator, sequence: str, frame: int, reduction: int, count: int
+    ) -> list[Future[Target]]:
+        """Begin to load some of the views of a frame, as many as there are at most."""
+        seen = self.capture.seen_by(sequence, frame)
+        chosen = rng.choice(seen, min(count, len(seen)), replace=False) if seen else ()
+        return [
+            self._thread.submit(load_target, self.capture, sequence, frame, int(index), reduction)
+            for index in chosen
+        ]
 
 
 @kernel

@@ -31,7 +31,7 @@ def registered():
     torch.manual_seed(0)
     config, capture = TrainConfig(), open_capture()
     avatar = Avatar.from_capture(capture, capture.body, config.atlas, config.model)
-    trainer = SegmentTrainer(config, capture, avatar, loop.training_clips(config, capture), None)
+    trainer = SegmentTrainer(config, capture, avatar, loop.training_clips(capture), None)
     rest = RestShapes(avatar, loop.still_frames(trainer, avatar.fps))
     optimizers, gradients = (
         make_optimizers(avatar, rest, config.schedule),

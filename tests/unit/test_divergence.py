@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from dsar.evaluation.divergence import median_distance, mmd, pose_features
+from dsar.data.divergence import median_distance, mmd, pose_features
 from dsar.types import Motion
 
 

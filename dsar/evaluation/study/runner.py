@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from dsar.config import PRESETS, TrainConfig, config_to_json
-from dsar.data.capture import open_capture
+from dsar.data.capture import capture_of
 from dsar.errors import ConfigError
 from dsar.evaluation.heldout import evaluate
 from dsar.evaluation.stress import stress
@@ -158,7 +158,7 @@ class Study:
     def _measure(self, each: Measurement) -> None:
         model, run = each.model, self._run(each.model)
         avatar, config, provenance = load_checkpoint(run)
-        capture = open_capture(config.capture)
+        capture = capture_of(config)
         streams: list[Stream] = [stream for stream in STREAMS if stream not in each.zeroed]
         found = {
             "config": json.loads(config_to_json(config)),

@@ -1,5 +1,7 @@
 """How far a motion's poses are from those of training (paper equation 24)."""
 
+from collections.abc import Mapping, Sequence
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -10,6 +12,8 @@ from dsar.types import Motion
 _BODY = slice(1, 22)
 """The body's joints; the root is left out: where one stands and faces is no pose."""
 _ROWS = 1024
+NEAR, FAR = 0.3, 0.6
+"""The paper's limits: below the first a sequence is near the training ones (nd), above the other far (fd)."""
 
 
 def pose_features(motion: Motion) -> Float[Tensor, "f 126"]:
@@ -40,3 +44,25 @@ def mmd(x: Float[Tensor, "n d"], y: Float[Tensor, "m d"], bandwidth: float) -> f
 
     squared = within(x) + within(y) - 2 * kernel(x, y).mean()
     return float(squared.clamp_min(0).sqrt())
+
+
+def divergence(motions: Mapping[str, Motion], train: Sequence[str], names: Sequence[str]) -> float:
+    """Return how far the poses of some sequences are from those of training: the MMD, not its square."""
+    known, new = (torch.cat([pose_features(motions[name]) for name in group]) for group in (train, names))
+    return mmd(known, new, median_distance(known))
+
+
+def label_sequences(
+    motions: Mapping[str, Motion], splits: Mapping[str, Sequence[str]]
+) -> dict[str, tuple[str, ...]]:
+    """Return the test sequences that are near the training ones (`nd`) and far from them (`fd`), by MMD."""
+    if sum(len(motions[name]) for name in splits["train"]) < 2:
+        return {}
+    labels: dict[str, tuple[str, ...]] = {}
+    for name in splits["test"]:
+        if len(motions[name]) > 1:
+            found = divergence(motions, splits["train"], [name])
+            label = "nd" if found < NEAR else "fd" if found > FAR else None
+            if label:
+                labels[label] = (*labels.get(label, ()), name)
+    return labels

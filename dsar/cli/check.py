@@ -1,0 +1,77 @@
+"""`dsar check`."""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from dsar.cli.common import Common
+from dsar.config import PRESETS
+from dsar.console import Bar
+
+_MINUTES = 60.0
+
+
+@dataclass(frozen=True)
+class Check(Common):
+    """Read a capture, lay the body over its images, and say what is wrong with it and how to mend it."""
+
+    capture: tyro.conf.Positional[str] = "embedded"
+    """A capture folder in any supported format, or `embedded`."""
+    body: Path | None = None
+    """SMPL-X model file (.npz, .pkl), or a folder of them; default: $DSAR_BODY, else the capture's own."""
+    train_frames: str | None = None
+    """Frames that train, e.g. 0-239, as in `dsar train`."""
+    test_frames: str | None = None
+    """Frames that test."""
+    sheet: Path | None = None
+    """PNG of the body over the images; default runs/check/NAME.png."""
+
+    def run(self) -> None:
+        """Check, print, write the sheet; exit with 2 where the capture cannot train."""
+        from dsar.data.capture import open_capture
+        from dsar.evaluation.check import check_capture, draw_overlays
+        from dsar_render import write_sheet
+
+        capture = open_capture(
+            self.capture, body=self.body, train_frames=self.train_frames, test_frames=self.test_frames
+        )
+        with Bar(self.progress, "check").running() as bar:
+            verdict = check_capture(capture, lambda what, share: bar.show(share, what))
+        rows, columns = draw_overlays(capture)
+        sheet = write_sheet(
+            self.sheet or Path("runs/check") / f"{capture.name}.png",
+            rows,
+            columns=columns,
+        )
+        needs = self.estimate()
+        self.write_json(verdict.to_json() | {"sheet": str(sheet), "demo_preset": needs})
+        for camera in verdict.cameras:
+            shares = (
+                f"{camera.inside:6.1%} of the body in the mask, IoU {camera.iou:.2f}"
+                if camera.inside is not None and camera.iou is not None
+                else "no image to compare"
+            )
+            sys.stdout.write(
+                f"{camera.name:16s} {camera.images} images, {camera.missing} missing, {shares}\n"
+            )
+        for key, value in verdict.figures.items():
+            sys.stdout.write(f"{key}: {value}\n")
+        for finding in verdict.findings:
+            sys.stdout.write(
+                f"{'CANNOT TRAIN' if finding.fatal else 'WRONG'} {finding.name}: {finding.what}\n"
+            )
+        sys.stdout.write(f"{'nothing is wrong' if not verdict.findings else 'see above'}; look at {sheet}\n")
+        if verdict.fatal:
+            raise SystemExit(2)
+
+    def estimate(self) -> dict[str, Any]:
+        """Return what training with the demo's preset would need on this machine."""
+        from dsar.training.budget import estimate, measure_flops
+
+        config = PRESETS["demo"]
+        budget = estimate(config)
+        seconds = budget.flop / measure_flops() * config.schedule.steps
+        return {"worker_bytes": budget.memory, "minutes_at_least": seconds / _MINUTES}

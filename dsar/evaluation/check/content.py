@@ -1,0 +1,103 @@
+"""What a capture's files hold: every image is read, times and speeds are counted."""
+
+import itertools
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from hashlib import blake2b
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from dsar.avatar.track import find_jumps
+from dsar.body.skinning import forward_kinematics
+from dsar.data.multiview import MultiViewCapture
+from dsar.data.speeds import joint_speeds
+from dsar.errors import CaptureError
+
+_THREADS = 2
+_MOVING = 0.05
+_EDGES = (0.0, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
+
+
+@dataclass(frozen=True)
+class Picture:
+    """What is kept of an image that was read."""
+
+    sequence: str
+    frame: int
+    camera: int
+    """Index in the capture."""
+    digest: bytes
+    """Tells whether two images are the same."""
+    coverage: float
+    """Share of the image that the mask covers."""
+    border: float
+    """Share of the image's border that it covers."""
+    broken: str | None = None
+    """Why it cannot be read."""
+
+
+def read_pictures(capture: MultiViewCapture) -> Iterator[Picture]:
+    """Yield every image of a capture, sequence by sequence and camera by camera."""
+
+    def load(place: tuple[str, int, int]) -> Picture:
+        try:
+            image = capture.image(*place)
+        except CaptureError as error:
+            return Picture(*place, b"", 0.0, 0.0, str(error))
+        return Picture(*place, blake2b(image.tobytes(), digest_size=16).digest(), *_cover(image[..., 3]))
+
+    places = (
+        (name, frame, index)
+        for name, motion in capture.motions.items()
+        for index in range(len(capture.cameras))
+        for frame in range(len(motion))
+        if index in capture.seen_by(name, frame)
+    )
+    with ThreadPoolExecutor(_THREADS) as threads:
+        yield from threads.map(load, places)
+
+
+def count_images(capture: MultiViewCapture) -> int:
+    """Return how many images a capture has."""
+    return sum(
+        len(capture.seen_by(name, frame))
+        for name, motion in capture.motions.items()
+        for frame in range(len(motion))
+    )
+
+
+def count_duplicates(capture: MultiViewCapture, pictures: Sequence[Picture]) -> dict[int, int]:
+    """Return how many images of each camera equal the one before, though the body moved."""
+    speeds = {name: joint_speeds(capture.body, motion) for name, motion in capture.motions.items()}
+    moving = {name: (each > _MOVING).tolist() for name, each in speeds.items()}
+    counts: Counter[int] = Counter()
+    for before, now in itertools.pairwise(pictures):
+        follows = (before.sequence, before.camera, before.frame + 1) == (now.sequence, now.camera, now.frame)
+        if follows and now.digest and before.digest == now.digest and moving[now.sequence][before.frame]:
+            counts[now.camera] += 1
+    return dict(counts)
+
+
+def count_jumps(capture: MultiViewCapture) -> dict[str, list[int]]:
+    """Return the frames of each sequence in which a body is where it cannot have come from."""
+    found = {}
+    for name, motion in capture.motions.items():
+        transforms = forward_kinematics(capture.body, motion.rotations, motion.translations)
+        found[name] = find_jumps(transforms, capture.body.joints[0], motion.fps)
+    return {name: frames for name, frames in found.items() if frames}
+
+
+def histogram(values: Float[Tensor, " n"]) -> dict[str, int]:
+    """Return counts of values between fixed edges."""
+    counts = np.histogram(values.numpy(), [*_EDGES, np.inf])[0].tolist()
+    names = [f"{low:g}-{high:g}" for low, high in itertools.pairwise(_EDGES)]
+    return dict(zip([*names, f">{_EDGES[-1]:g}"], counts, strict=True))
+
+
+def _cover(alpha: UInt8[np.ndarray, "h w"]) -> tuple[float, float]:
+    border = np.concatenate([alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1]])
+    return float((alpha > 127).mean()), float((border > 127).mean())

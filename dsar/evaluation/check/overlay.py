@@ -1,0 +1,53 @@
+"""The posed body drawn over a capture's images, to be looked at."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import UInt8
+
+from dsar.data.multiview import MultiViewCapture
+from dsar.evaluation.check.agreement import choose_frames, read, silhouette
+
+HEIGHT = 360
+"""Pixels of a picture's height at most."""
+_BODY = np.array([255.0, 80.0, 40.0])
+_SHARE = 0.45
+_DIM = 0.35
+
+
+def draw_overlays(
+    capture: MultiViewCapture, cameras: Sequence[int] | None = None
+) -> tuple[dict[str, list[UInt8[np.ndarray, "h w 3"]]], list[str]]:
+    """Return pictures by camera's name, one a frame, and the frames' names.
+
+    The background is dimmed where the mask is empty, the body is orange. White: no image.
+    """
+    reading, places = read(capture), choose_frames(capture.motions)
+    chosen = range(len(capture.cameras)) if cameras is None else cameras
+    rows = {
+        capture.cameras[index].name: [
+            _draw(capture, reading.vertices(*place), *place, index) for place in places
+        ]
+        for index in chosen
+    }
+    return rows, [f"{name} {frame}" for name, frame in places]
+
+
+def _draw(
+    capture: MultiViewCapture, vertices: torch.Tensor, sequence: str, frame: int, index: int
+) -> UInt8[np.ndarray, "h w 3"]:
+    camera = capture.cameras[index]
+    reduction = -(-camera.height // HEIGHT)
+    height, width = camera.height // reduction, camera.width // reduction
+    if index not in capture.seen_by(sequence, frame):
+        return np.full((height, width, 3), 255, np.uint8)
+    whole = dataclasses.replace(camera, width=width * reduction, height=height * reduction)
+    pixels = capture.image(sequence, frame, index)[: height * reduction, : width * reduction].astype(
+        np.float32
+    )
+    small = pixels.reshape(height, reduction, width, reduction, 4).mean((1, 3))
+    colors = small[..., :3] * (_DIM + (1 - _DIM) * small[..., 3:] / 255)
+    body = _SHARE * silhouette(vertices, capture.body.faces, whole.resized(width, height)).numpy()[..., None]
+    return (colors * (1 - body) + _BODY * body).clip(0, 255).astype(np.uint8)

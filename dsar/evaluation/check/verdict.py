@@ -1,0 +1,304 @@
+"""The verdict on a capture: what was measured, what is wrong, what to do."""
+
+import dataclasses
+import statistics
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dsar.body.files import load_hands
+from dsar.data.divergence import divergence
+from dsar.data.multiview import MultiViewCapture
+from dsar.data.speeds import joint_speeds
+from dsar.errors import BodyError, CaptureError
+from dsar.evaluation.check import content
+from dsar.evaluation.check.agreement import (
+    FINE,
+    Agreement,
+    Mask,
+    Reading,
+    around_hands,
+    compare,
+    errors,
+    load_masks,
+    read,
+)
+from dsar.evaluation.check.mistakes import (
+    Suspect,
+    coarse_mistakes,
+    controls,
+    find_mistake,
+    half_pixels,
+    hand_mistakes,
+    is_clearer,
+)
+
+APART = 0.5
+"""Share of the body in the masks below which a capture cannot train."""
+POOR = 0.9
+"""And below which something is likely wrong."""
+_LISTED = 5
+Reporter = Callable[[str, float], None]
+"""Is told what is being done, and the share of it that is done."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something that is wrong."""
+
+    name: str
+    """A word for it, stable."""
+    what: str
+    """What, where, and what to do."""
+    fatal: bool = False
+    """Whether the capture cannot train."""
+
+
+@dataclass(frozen=True)
+class CameraVerdict:
+    """How one camera's images agree with the body."""
+
+    name: str
+    images: int
+    """How many there are."""
+    missing: int
+    """How many there are not."""
+    inside: float | None
+    """Mean share of the body's silhouette in the mask; None without images."""
+    iou: float | None
+    """Mean intersection over union: below 1 also where clothes stand off."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What `dsar check` found."""
+
+    cameras: Sequence[CameraVerdict]
+    findings: Sequence[Finding]
+    figures: Mapping[str, Any] = field(default_factory=dict)
+    """Speeds, duplicates, divergence of the test sequences, sizes."""
+
+    @property
+    def fatal(self) -> bool:
+        """Whether the capture cannot train."""
+        return any(finding.fatal for finding in self.findings)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return everything in JSON's types."""
+        return {**dataclasses.asdict(self), "fatal": self.fatal}
+
+
+def check_capture(capture: MultiViewCapture, report: Reporter = lambda *_: None) -> Verdict:
+    """Read all of a capture and return what is wrong with it.
+
+    Raises:
+        CaptureError: no image at all can be read.
+    """
+    findings, figures = [], {}
+    total, pictures, began = content.count_images(capture), [], time.monotonic()
+    for picture in content.read_pictures(capture):
+        pictures.append(picture)
+        report("read images", 0.8 * len(pictures) / max(total, 1))
+    readable = [picture for picture in pictures if picture.broken is None]
+    if not readable:
+        raise CaptureError(f"capture {capture.name}: none of its {total} images can be read")
+    findings += _judge_pictures(capture, pictures)
+    figures["read_ms"] = 1e3 * (time.monotonic() - began) / total
+    figures |= _describe(capture, pictures)
+    report("compare body and masks", 0.8)
+    usable = {(p.sequence, p.frame, p.camera) for p in readable if p.coverage > 0}
+    masks, reading = load_masks(capture, usable), read(capture)
+    agreements = list(compare(reading, masks))
+    if masks and not any(finding.name == "masks_inverted" for finding in findings):
+        findings += _judge_agreement(capture, reading, masks, agreements)
+        report("look for fine mistakes", 0.95)
+        if not any(finding.fatal for finding in findings):
+            findings += _judge_details(capture, reading, load_masks(capture, usable, FINE))
+    # In other units every step is a jump.
+    if not any(finding.name.startswith("motion_in") for finding in findings):
+        findings += [
+            Finding("jumps", f"sequence {name}: the body jumps at frame {_list(frames)}; cut it there")
+            for name, frames in content.count_jumps(capture).items()
+        ]
+    return Verdict(_by_camera(capture, masks, agreements, pictures), findings, figures)
+
+
+def _judge_pictures(capture: MultiViewCapture, pictures: Sequence[content.Picture]) -> list[Finding]:
+    findings = []
+    broken = [picture.broken for picture in pictures if picture.broken is not None]
+    if broken:
+        findings.append(
+            Finding(
+                "broken_images",
+                f"{len(broken)} images cannot be read; replace or delete them: {broken[0]}",
+                True,
+            )
+        )
+    sound = [picture for picture in pictures if picture.broken is None]
+    border = statistics.fmean(each.border for each in sound)
+    if border > 0.5:
+        findings.append(
+            Finding(
+                "masks_inverted",
+                f"masks cover {border:.0%} of the images' borders: they show the background; invert them",
+                True,
+            )
+        )
+    empty = [picture for picture in sound if picture.coverage == 0]
+    if empty:
+        first = empty[0]
+        where = f"{first.sequence}, frame {first.frame}, {capture.cameras[first.camera].name}"
+        everything = len(empty) == len(sound)
+        findings.append(
+            Finding(
+                "empty_masks",
+                f"{len(empty)} masks are empty, the first is {where}; make them anew",
+                everything,
+            )
+        )
+    for camera, count in sorted(content.count_duplicates(capture, pictures).items()):
+        findings.append(
+            Finding(
+                "duplicate_frames",
+                f"{capture.cameras[camera].name}: {count} images equal the one before though the body moved: "
+                "the recording stuttered, or frames were filled in; delete them, they are done without",
+            )
+        )
+    return findings
+
+
+def _judge_agreement(
+    capture: MultiViewCapture, reading: Reading, masks: Sequence[Mask], agreements: Sequence[Agreement]
+) -> list[Finding]:
+    """Return what body and masks say of cameras, motion and numbering."""
+    inside = statistics.fmean(each.inside for each in agreements)
+    before = np.array([each.error for each in agreements])
+    suspect = find_mistake(reading, masks, coarse_mistakes(capture.turn), before)
+    apart = inside < APART
+    findings = [_of_suspect(suspect, apart)] if suspect else []
+    if suspect is None or suspect.mistake.name.startswith("frame_offset"):
+        findings += _judge_cameras(capture, reading, masks, before)
+    if not findings and inside < POOR:
+        what = f"only {inside:.0%} of the body is in the masks"
+        findings.append(
+            Finding(
+                "body_apart",
+                f"{what}, and no usual mistake explains it: look at the sheet; are body file, shape and "
+                "calibration the right ones?",
+                apart,
+            )
+        )
+    return findings
+
+
+def _judge_cameras(
+    capture: MultiViewCapture, reading: Reading, masks: Sequence[Mask], before: np.ndarray
+) -> list[Finding]:
+    """Return which cameras agree much less than the others, and whose images theirs are."""
+    index = np.array([mask.camera for mask in masks])
+    means = {int(camera): float(before[index == camera].mean()) for camera in np.unique(index)}
+    usual = statistics.median(means.values())
+    findings = []
+    for camera, mean in means.items():
+        if mean < 1.5 * usual or mean < usual + 0.1:
+            continue
+        own = [mask for mask in masks if mask.camera == camera]
+        others = {
+            k: errors(dataclasses.replace(reading, cameras={camera: reading.cameras[k]}), own).mean()
+            for k in reading.cameras
+            if k != camera
+        }
+        best = min(others, key=lambda k: others[k])
+        name = capture.cameras[camera].name
+        if others[best] < 0.5 * mean:
+            what = f"the images of {name} are those of {capture.cameras[best].name}: exchange their folders"
+            findings.append(Finding("cameras_swapped", what))
+        else:
+            what = f"{name} disagrees with the others: calibrate it anew, or leave it out (it may run late)"
+            findings.append(Finding("camera_off", what))
+    return findings
+
+
+def _judge_details(capture: MultiViewCapture, reading: Reading, masks: Sequence[Mask]) -> list[Finding]:
+    """Return what shows at full resolution only."""
+    suspects = []
+    suspect = find_mistake(reading, masks, half_pixels(), errors(reading, masks))
+    if suspect is not None:
+        # A fit that is a little off gains by a move in other directions too.
+        after = errors(suspect.mistake.mend(reading), masks)
+        if all(is_clearer(errors(other, masks), after) for other in controls(reading)):
+            suspects.append(suspect)
+    hands = around_hands(reading, masks)
+    if hands:
+        mistakes = hand_mistakes(_mean_hands(capture))
+        suspects.append(find_mistake(reading, hands, mistakes, errors(reading, hands)))
+    return [_of_suspect(suspect, fatal=False) for suspect in suspects if suspect is not None]
+
+
+def _mean_hands(capture: MultiViewCapture) -> Float[Tensor, "2 45"] | None:
+    try:
+        return load_hands(capture.body_path)[1] if capture.body_path else None
+    except BodyError:
+        return None
+
+
+def _of_suspect(suspect: Suspect, fatal: bool) -> Finding:
+    share = f"{suspect.before:.3f} to {suspect.after:.3f}"
+    return Finding(suspect.mistake.name, f"{suspect.mistake.remedy} (the error falls from {share})", fatal)
+
+
+def _describe(capture: MultiViewCapture, pictures: Sequence[content.Picture]) -> dict[str, Any]:
+    """Return what is known of motion and files without comparing them."""
+    speeds = torch.cat([joint_speeds(capture.body, motion) for motion in capture.motions.values()])
+    splits = capture.splits
+    percentiles = np.percentile(speeds.numpy(), [50, 95, 99.9]) if len(speeds) else [0.0] * 3
+    divergences = {}
+    for name in splits["test"]:
+        if len(capture.motions[name]) > 1:
+            found = divergence(capture.motions, splits["train"], [name])
+            divergences[name] = {"mmd": found, "mmd_squared": found**2}
+    return {
+        "frames": {name: len(motion) for name, motion in capture.motions.items()},
+        "fps": capture.fps,
+        "splits": {split: list(names) for split, names in splits.items()},
+        "divergence": divergences,
+        "fastest_joint_m_s": dict(zip(("p50", "p95", "p99.9"), map(float, percentiles), strict=True)),
+        "fastest_joint_histogram": content.histogram(speeds),
+        "duplicates": {
+            capture.cameras[k].name: count for k, count in content.count_duplicates(capture, pictures).items()
+        },
+        "disk_bytes": sum(path.stat().st_size for path in capture.root.rglob("*") if path.is_file()),
+    }
+
+
+def _by_camera(
+    capture: MultiViewCapture,
+    masks: Sequence[Mask],
+    agreements: Sequence[Agreement],
+    pictures: Sequence[content.Picture],
+) -> list[CameraVerdict]:
+    frames, verdicts = sum(map(len, capture.motions.values())), []
+    for index, camera in enumerate(capture.cameras):
+        own = [each for mask, each in zip(masks, agreements, strict=True) if mask.camera == index]
+        count = sum(picture.camera == index for picture in pictures)
+        verdicts.append(
+            CameraVerdict(
+                camera.name,
+                count,
+                frames - count,
+                statistics.fmean(each.inside for each in own) if own else None,
+                statistics.fmean(each.iou for each in own) if own else None,
+            )
+        )
+    return verdicts
+
+
+def _list(frames: Sequence[int]) -> str:
+    more = f" and {len(frames) - _LISTED} more" if len(frames) > _LISTED else ""
+    return ", ".join(map(str, frames[:_LISTED])) + more
