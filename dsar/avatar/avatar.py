@@ -108,7 +108,7 @@ class Avatar(nn.Module):
         tracks = {n: forward_kinematics(body, m.rotations, m.translations) for n, m in motions.items()}
         charts, hidden = [body_chart(body, atlas.resolution)], None
         if atlas.garment == "auto":
-            still = stillest_frames(tracks, fps, GARMENT_FRAMES, per_sequence=3)
+            still = stillest_frames(tracks, fps, GARMENT_FRAMES, 3, capture.seen_by)
             pelvis = torch.stack([tracks[name][frame, 0] for name, frame in still])
             size = (atlas.garment_rows, atlas.resolution)
             chart = fit_garment_chart(body, capture, still, pelvis, size, atlas.weight_smoothing)

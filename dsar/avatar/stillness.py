@@ -1,5 +1,8 @@
 """Frames in which the cloth can be taken to hang at rest."""
 
+import itertools
+from collections.abc import Callable
+
 import torch
 from jaxtyping import Float, Float32
 from torch import Tensor
@@ -21,17 +24,22 @@ def restlessness(joints: Float[Tensor, "f j 3"], fps: float) -> Float[Tensor, " 
 
 
 def stillest_frames(
-    tracks: dict[str, Float32[Tensor, "_ j 4 4"]], fps: float, count: int, per_sequence: int
+    tracks: dict[str, Float32[Tensor, "_ j 4 4"]],
+    fps: float,
+    count: int,
+    per_sequence: int,
+    usable: Callable[[str, int], object],
 ) -> list[tuple[str, int]]:
     """Return the `count` stillest frames, at most `per_sequence` from any sequence.
 
-    `tracks` holds T_world_rest of the joints for each frame of each sequence.
+    `tracks` holds T_world_rest of the joints for each frame of each sequence; `usable` tells of a sequence's
+    frame whether it may be taken.
     """
     candidates = []
     for name, track in tracks.items():
         # Where the transforms carry two points tells how fast each joint translates and turns.
         heads = track[:, :, :3, 3] + track[:, :, :3, :3].sum(-1) * 0.3
         scores = restlessness(heads, fps)
-        best = scores.argsort(stable=True)[:per_sequence]
-        candidates += [(float(scores[i]), name, int(i)) for i in best]
+        stillest = (int(i) for i in scores.argsort(stable=True) if usable(name, int(i)))
+        candidates += [(float(scores[i]), name, i) for i in itertools.islice(stillest, per_sequence)]
     return [(name, frame) for _, name, frame in sorted(candidates)[:count]]

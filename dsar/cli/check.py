@@ -21,7 +21,7 @@ class Check(Common):
     capture: tyro.conf.Positional[str] = "embedded"
     """A capture folder in any supported format, or `embedded`."""
     body: Path | None = None
-    """SMPL-X model file (.npz, .pkl), or a folder of them; default: $DSAR_BODY, else the capture's own."""
+    """SMPL-X model file (.npz, .pkl), or a folder of them; default: the capture's own, or $DSAR_BODY."""
     train_frames: str | None = None
     """Frames that train, e.g. 0-239, as in `dsar train`."""
     test_frames: str | None = None
@@ -59,6 +59,10 @@ class Check(Common):
             )
         for key, value in verdict.figures.items():
             sys.stdout.write(f"{key}: {value}\n")
+        sys.stdout.write(
+            f"training with the demo's preset: {needs['worker_bytes'] / 2**30:.1f} GiB a worker, and "
+            f"{needs['minutes_at_least']:.0f} minutes or more\n"
+        )
         for finding in verdict.findings:
             sys.stdout.write(
                 f"{'CANNOT TRAIN' if finding.fatal else 'WRONG'} {finding.name}: {finding.what}\n"

@@ -30,7 +30,7 @@ class Drive(Common):
         from dsar.avatar.rollout import START_FRAME
         from dsar.data.capture import capture_of
         from dsar.data.motion import read_motion, resample
-        from dsar.data.speeds import warn_of_speed
+        from dsar.data.novelty import report_novelty
         from dsar.training.checkpoint import Run, load_checkpoint, newest_run
         from dsar_exporters import parse_frames
 
@@ -48,7 +48,7 @@ class Drive(Common):
             motion = resample(motion, avatar.fps)
         if name is None:
             known = [capture.motions[trained] for trained in capture.splits["train"]]
-            warn_of_speed(avatar.body, motion, known, START_FRAME)
+            report_novelty(avatar.body, motion, known, START_FRAME)
         sequence = roll_out(avatar, motion, frames=frames, provenance=provenance)
         return sequence, list(capture.cameras), motion.name
 

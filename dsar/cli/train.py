@@ -24,7 +24,8 @@ class Train(Common):
     out: Path | None = None
     """Run folder; default runs/<preset>."""
     body: Path | None = None
-    """SMPL-X model file (.npz, .pkl); default: the capture's own, else the embedded body."""
+    """SMPL-X model file (.npz, .pkl), or a folder of SMPLX_<GENDER> files; default: the capture's own, or
+    $DSAR_BODY where its format brings none, else the embedded body."""
     train_frames: str | None = None
     """Frames of each training sequence, e.g. 0-239."""
     test_frames: str | None = None

@@ -148,11 +148,14 @@ def _capture(
     path = root / PARAMETERS
     arrays = read_arrays(path, "betas")
     rotations, translations = read_poses(path, arrays)
+    betas = arrays.get("betas")
+    if betas is None or not betas.size:
+        raise CaptureError(f"motion file {path}: expected the person's shape as betas, found none")
     # One shape for the whole take: files repeat it by frame, or hold it once.
-    betas = torch.from_numpy(arrays["betas"].reshape(-1, arrays["betas"].shape[-1])[0]).float()
+    shape = torch.from_numpy(betas.reshape(-1, betas.shape[-1])[0]).float()
     take = Take(
         Motion(rotations, translations, fps, camera_name(root.name).removeprefix("cam_")),
         dataclasses.replace(photos, frames=range(len(rotations))),
     )
     reopen = partial(open_again, root, opening)
-    return make_capture(root, root.name, cameras, [take], opening, reopen, betas=betas)
+    return make_capture(root, root.name, cameras, [take], opening, reopen, betas=shape)

@@ -111,7 +111,7 @@ def parse_bvh(path: Path) -> tuple[Skeleton, Float[np.ndarray, "f c"], float]:
         raise MotionError(f"motion file {path}: {where} is not a finite number above what can be; cut it out")
     # Files give the time of a frame in few digits: .0083333 is 120 a second.
     fps = 1 / seconds
-    return skeleton, values, float(round(fps)) if abs(fps - round(fps)) < 1e-3 * fps else fps
+    return skeleton, values, float(round(fps)) if abs(fps - round(fps)) < 1e-4 * fps else fps
 
 
 def _parse_hierarchy(text: str) -> Skeleton:

@@ -53,9 +53,7 @@ def make_camera(where: str, name: str, K: Any, T_camera_world: Any, size: tuple[
     return Camera(intrinsics, transform, width, height, name)
 
 
-def opencv_camera(
-    where: str, name: str, K: Any, R: Any, T: Any, size: tuple[int, int], *, unit: float = 1.0
-) -> Camera:
+def opencv_camera(where: str, name: str, K: Any, R: Any, T: Any, size: tuple[int, int]) -> Camera:
     """Return a camera from an OpenCV calibration: x_camera = R x_world + T.
 
     OpenCV's pixel centres are whole numbers; half a pixel is added to the principal point.
@@ -67,7 +65,6 @@ def opencv_camera(
         R: Likewise.
         T: Three numbers.
         size: Width and height in pixels.
-        unit: Metres of a unit of T.
 
     Raises:
         CaptureError: They are no such numbers.
@@ -84,7 +81,7 @@ def opencv_camera(
     intrinsics, rotation, translation = matrices
     intrinsics[:2, 2] += 0.5
     transform = torch.eye(4, dtype=torch.float64)
-    transform[:3, :3], transform[:3, 3] = rotation, translation * unit
+    transform[:3, :3], transform[:3, 3] = rotation, translation
     return make_camera(where, camera_name(name), intrinsics.tolist(), transform.tolist(), size)
 
 

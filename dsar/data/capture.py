@@ -54,7 +54,7 @@ def open_capture(
         source: A capture folder in any format of `FORMATS`, or `embedded` for the one that comes with the
             package.
         body: A body-model file instead of the capture's own, or a folder of SMPLX_<GENDER> files. Without
-            one, captures that bring none take $DSAR_BODY.
+            one, captures in foreign formats take $DSAR_BODY.
         train_frames: Frames that train, such as 0-239: of a capture's single take, or of each training one.
         test_frames: Frames that test, likewise.
 
@@ -63,7 +63,7 @@ def open_capture(
         MotionError: Its motion is.
         BodyError: The body file is.
     """
-    root = EMBEDDED_CAPTURE if source == "embedded" else Path(source)
+    root = EMBEDDED_CAPTURE if source == "embedded" else Path(source).resolve()
     if not root.is_dir():
         raise CaptureError(f"capture {root}: no such folder; give a capture folder or `embedded`")
     opening = Opening(None if body is None else Path(body), train_frames, test_frames)

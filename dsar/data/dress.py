@@ -72,6 +72,12 @@ def open_dress(root: Path, opening: Opening) -> MultiViewCapture:
         else sorted((path.parent for path in root.glob(f"*/{_INFO}")), key=_take_order)
     )
     released, names = _read_cameras(folders[0])
+    for folder in folders[1:]:
+        if not _same_cameras(released, _read_cameras(folder)[0]):
+            raise CaptureError(
+                f"{folder / 'Capture' / 'cameras.pkl'}: differs from that of {folders[0].name}; open takes "
+                "that were calibrated apart one by one"
+            )
     info = [_read_info(folder) for folder in folders]
     gender = str(info[0][1] or "neutral")
     body = choose_body(opening.body, gender)
@@ -137,7 +143,8 @@ def read_data(path: Path) -> Mapping[str, Any]:
 
 def _read_info(folder: Path) -> tuple[list[str], str | None]:
     info = read_data(folder / _INFO)
-    frames = [str(frame) for frame in info.get("scan_frames", [])]
+    found = info.get("scan_frames")
+    frames = [str(frame) for frame in found] if isinstance(found, (list, tuple, np.ndarray)) else []
     if not frames:
         raise CaptureError(f"{folder / _INFO}: expected the names of frames as scan_frames, found none")
     gender = info.get("gender")
@@ -167,11 +174,27 @@ def _read_cameras(folder: Path) -> tuple[list[Camera], dict[str, str]]:
     return cameras, names
 
 
+def _same_cameras(one: Sequence[Camera], other: Sequence[Camera]) -> bool:
+    """Return whether cameras are the same but for rounding."""
+    if [(c.name, c.width, c.height) for c in one] != [(c.name, c.width, c.height) for c in other]:
+        return False
+    return all(
+        torch.allclose(a.K, b.K, atol=1e-3) and torch.allclose(a.T_camera_world, b.T_camera_world, atol=1e-5)
+        for a, b in zip(one, other, strict=True)
+    )
+
+
 def _read_fits(
     folder: Path, frames: Sequence[str], hands: tuple[Float[Tensor, "2 k 45"], Float[Tensor, "2 45"]] | None
 ) -> tuple[Motion, Float[Tensor, " s"]]:
     """Return a take's motion and its mean shape."""
-    fits = [_read_fit(folder / "SMPLX" / f"mesh-f{frame}_smplx.pkl", hands) for frame in frames]
+    paths = [folder / "SMPLX" / f"mesh-f{frame}_smplx.pkl" for frame in frames]
+    fits = [_read_fit(path, hands) for path in paths]
+    for path, (_, _, betas) in zip(paths, fits, strict=True):
+        if len(betas) != len(fits[0][2]):
+            raise MotionError(
+                f"motion file {path}: betas has {len(betas)} numbers, {paths[0]} {len(fits[0][2])}"
+            )
     rotations, translations, shapes = (torch.stack(each) for each in zip(*fits, strict=True))
     return Motion(rotations, translations, FPS, folder.name), shapes.mean(0)
 

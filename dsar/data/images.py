@@ -28,7 +28,7 @@ _DAMAGE = (
     Image.DecompressionBombError,
     Image.DecompressionBombWarning,
 )
-ROOM = 1 << 30
+ROOM = 1 << 28
 """Bytes of decoded images that a process keeps."""
 
 

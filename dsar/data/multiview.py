@@ -14,6 +14,7 @@ from torch import Tensor
 
 from dsar.body.model import Body
 from dsar.data.frames import parse_range
+from dsar.data.images import ROOM
 from dsar.errors import CaptureError, ConfigError
 from dsar.geometry.cameras import spread_out
 from dsar.types import Camera, Motion
@@ -88,11 +89,21 @@ class MultiViewCapture:
     """Files of the garment's true vertices, of the sequences that have one."""
     starts: Mapping[str, int] = field(default_factory=dict)
     """Which frame of its images is a sequence's first, where that is not 0."""
+    backdrop: bool = False
+    """Whether images are photographs, with colours outside the masks, and kept once they were decoded."""
     turn: Float[Tensor, "3 3"] = field(default_factory=lambda: torch.eye(3))
     """Rotation from the world of the capture's files to ours, in which Y is up."""
 
     def __reduce__(self) -> tuple[Callable[..., "MultiViewCapture"], tuple]:
         return _reopen, (self.reopen, tuple(camera.name for camera in self.cameras))
+
+    @property
+    def kept_bytes(self) -> int:
+        """Bytes of decoded images that a process keeps at most, while it reads this capture."""
+        if not self.backdrop:
+            return 0
+        pixels = sum(camera.width * camera.height for camera in self.cameras)
+        return min(ROOM, 4 * pixels * sum(map(len, self.motions.values())))
 
     def with_cameras(self, count: int | None) -> "MultiViewCapture":
         """Return the capture as seen by some of its cameras, spread as far as can be; None: by all."""

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import UInt8
 from PIL import Image, UnidentifiedImageError
 
-from dsar.body.files import load_body
+from dsar.body.files import choose_body, load_body
 from dsar.body.model import Body
 from dsar.data.calibration import make_camera
 from dsar.data.images import decode_rgba
@@ -109,7 +109,7 @@ def open_native(root: Path, body: Path | None = None) -> MultiViewCapture:
 
     Args:
         root: The folder with its capture.json.
-        body: A body-model file instead of the capture's own.
+        body: A body-model file instead of the capture's own, or a folder of which the neutral is taken.
 
     Raises:
         CaptureError: Something is missing or malformed; the message names it.
@@ -133,7 +133,13 @@ def open_native(root: Path, body: Path | None = None) -> MultiViewCapture:
     for name, entry in sequences.items():
         images[name] = _Images(root / _get(entry, "images", str, f"{where}, sequence {name}"))
         images[name].check(cameras, _get(entry, "frames", int, f"{where}, sequence {name}"))
-    body_path = body or (root / record["body"] if record.get("body") else None)
+    recorded = root / record["body"] if record.get("body") else None
+    body_path = choose_body(body, "neutral") if body else recorded
+    if body_path != recorded:
+        LOGGER.warning(
+            "Capture %s: shape and motion were fitted with %s; with %s they may be centimetres off",
+            *(root, recorded or "the embedded body", body_path),
+        )
     betas = torch.tensor(_get(record, "betas", list, where), dtype=torch.float32)
     shaped = load_body(body_path, betas if len(betas) else None)
     return MultiViewCapture(

@@ -8,7 +8,7 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -86,10 +86,15 @@ class Scans:
             mesh = {key: np.asarray(content[key], kind) for key, kind in kinds.items()}
         except (KeyError, TypeError, ValueError) as error:
             raise CaptureError(f"scan {path}: expected vertices, faces and uvs ({error!r})") from error
-        count = len(mesh["vertices"])
-        shapes = {"vertices": (count, 3), "uvs": (count, 2), "faces": (len(mesh["faces"]), 3)}
+        count = mesh["vertices"].size // 3
+        shapes = {"vertices": (count, 3), "uvs": (count, 2), "faces": (mesh["faces"].size // 3, 3)}
         wrong = [key for key, shape in shapes.items() if mesh[key].shape != shape]
-        if wrong or not count or mesh["faces"].min() < 0 or mesh["faces"].max() >= count:
+        if (
+            wrong
+            or not (count and mesh["faces"].size)
+            or mesh["faces"].min() < 0
+            or mesh["faces"].max() >= count
+        ):
             found = {key: value.shape for key, value in mesh.items()}
             raise CaptureError(f"scan {path}: expected one uv a vertex and faces of them, found {found}")
         if not np.isfinite(mesh["vertices"]).all():
@@ -106,7 +111,9 @@ class Scans:
         return torch.from_numpy(np.ascontiguousarray(image[..., :3])).float() / 255
 
 
+@lru_cache(maxsize=4)
 def _load(path: Path) -> Any:
+    """Return what a pickle holds; kept for the next camera of the same frame."""
     try:
         return read_pickle(path)
     except PICKLE_ERRORS as error:

@@ -52,7 +52,8 @@ class Opening:
     """How a user wants a capture opened."""
 
     body: Path | None = None
-    """Body-model file, or a folder of SMPLX_<GENDER> files; None: $DSAR_BODY, else the capture's own."""
+    """Body-model file, or a folder of SMPLX_<GENDER> files; None: the capture's own, or $DSAR_BODY if its
+    format brings none."""
     train_frames: str | None = None
     """Frames that train, such as 0-239: of a single take, or of each training take."""
     test_frames: str | None = None
@@ -110,6 +111,7 @@ def make_capture(
         views=views,
         starts=starts,
         turn=turn,
+        backdrop=True,
         reopen=reopen,
     )
 

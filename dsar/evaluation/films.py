@@ -60,6 +60,9 @@ def evaluate_films(
     for split, names in splits.items():
         found[split] = {}
         films = [score for name in names for score in scores[name]]
+        if not any(whole_films(capture, name) for name in names):
+            skipped |= dict.fromkeys(("vmaf", *judges), "no camera has an image of every frame")
+            continue
         if films:
             found[split]["vmaf"] = statistics.fmean(films)
         for metric in judges:

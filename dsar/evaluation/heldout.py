@@ -141,8 +141,8 @@ def one_to_many(
 ) -> dict[str, float] | None:
     """Return correlation and size ratio of predicted against true difference at one pose with two pasts.
 
-    For each pair the images after a stop and at rest are subtracted, over all cameras, inside either
-    true mask. A model without history predicts no difference: correlation 0, ratio 0.
+    For each pair the images after a stop and at rest are subtracted, over all cameras that have them all,
+    inside either true mask. A model without history predicts no difference: correlation 0, ratio 0.
     """
     predicted, true = [], []
     for pair in capture.one_to_many:
@@ -153,7 +153,9 @@ def one_to_many(
             for number, gaussians in roll_out(avatar, capture.motions[pair.sequence], streams=streams)
             if number - START_FRAME in frames
         }
-        for index, camera in enumerate(capture.cameras):
+        seen = set.intersection(*(set(capture.seen_by(pair.sequence, frame)) for frame in frames))
+        for index in sorted(seen):
+            camera = capture.cameras[index]
             still, still_image = (
                 true_view(capture, pair.sequence, rest, index),
                 render_white(made[rest], camera),
@@ -279,4 +281,5 @@ def summarize(
     for key in METRICS:
         values = [row[key] for row in rows if key in row]
         means[key] = statistics.fmean(values) if values else None
-    return means | {"frames": len(rows) // views, "views": views}
+    frames = {(name, row["frame"]) for name in names for row in by_sequence[name]}
+    return means | {"frames": len(frames), "views": views}

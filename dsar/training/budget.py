@@ -82,19 +82,20 @@ def estimate(config: TrainConfig) -> Budget:
     return Budget(memory, counter.get_total_flops(), parameters)
 
 
-def check_budget(config: TrainConfig, processes: int, done: float = 0.0) -> Budget:
+def check_budget(config: TrainConfig, processes: int, done: float = 0.0, images: int = 0) -> Budget:
     """Return the estimate of a run that fits this machine.
 
     Args:
         config: Its settings.
         processes: Workers on this machine.
         done: Share of the schedule that an earlier part of the run has done.
+        images: Bytes of decoded images that a worker keeps.
 
     Raises:
         ConfigError: it does not fit, with what to change.
     """
     budget, memory = estimate(config), available_memory()
-    needed = budget.memory * processes
+    needed = (budget.memory + images) * processes
     where = f"preset {config.preset}, {processes} worker(s) here"
     if memory is not None and needed > memory:
         raise ConfigError(

@@ -50,6 +50,9 @@ def train(config: TrainConfig, run: Run, *, resume: bool = False, report: Report
             TrainingError when a value stops being finite.
     """
     config.validate()
+    if resume and run.exists and config.body is None:
+        # What came from the environment was written down, and the environment may be another now.
+        config = dataclasses.replace(config, body=config_from_json(run.config).body)
     capture = capture_of(config).with_cameras(config.cameras)
     if config.schedule.views > len(capture.cameras):
         raise ConfigError(
@@ -63,7 +66,7 @@ def train(config: TrainConfig, run: Run, *, resume: bool = False, report: Report
     if resume:
         check_same_settings(config, config_from_json(run.config), run)
     done = ckpt.read_progress(run)["progress"] if resume else 0.0
-    check_budget(config, workers.here(config.workers), done)
+    check_budget(config, workers.here(config.workers), done, capture.kept_bytes)
     run.folder.mkdir(parents=True, exist_ok=True)
     run.config.write_text(config_to_json(config))
     workers.run_workers(config.workers, _train, (config, run.folder, resume), report)
@@ -73,7 +76,7 @@ def train(config: TrainConfig, run: Run, *, resume: bool = False, report: Report
 def with_body(config: TrainConfig, capture: MultiViewCapture) -> TrainConfig:
     """Return the settings with the body file that came from the environment written down."""
     path = capture.body_path
-    if config.body is not None or path is None or path.is_relative_to(capture.root):
+    if config.body is not None or path is None or path.resolve().is_relative_to(capture.root.resolve()):
         return config
     return dataclasses.replace(config, body=str(path.resolve()))
 
@@ -198,11 +201,11 @@ def training_clips(capture: Capture) -> dict[str, range]:
     """Return the frames of each training sequence.
 
     Raises:
-        CaptureError: there are none.
+        CaptureError: no camera saw any of them.
     """
     clips = {name: range(len(capture.motions[name])) for name in capture.splits["train"]}
-    if not clips:
-        raise CaptureError(f"capture {capture.name}: no sequence of it is for training")
+    if not any(capture.seen_by(name, frame) for name, clip in clips.items() for frame in clip):
+        raise CaptureError(f"capture {capture.name}: no camera has an image of a training frame")
     return clips
 
 
@@ -211,7 +214,7 @@ def still_frames(trainer: SegmentTrainer, fps: float) -> list[tuple[str, int]]:
     clips = trainer.streams.clips
     tracks = {name: trainer.tracks[name][: clip.stop, 0] for name, clip in clips.items()}
     per_sequence = max(1, -(-STILL_FRAMES // len(clips)))
-    return stillest_frames(tracks, fps, STILL_FRAMES, per_sequence)
+    return stillest_frames(tracks, fps, STILL_FRAMES, per_sequence, trainer.loader.capture.seen_by)
 
 
 def bad_gradient(avatar: Avatar) -> str:

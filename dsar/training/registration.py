@@ -7,7 +7,7 @@ maps that follow it through a sequence keep its place, and are the network's fir
 
 import dataclasses
 import functools
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import numpy as np
 import torch
@@ -80,6 +80,11 @@ class Registration:
         """Share of the budget of time that was used."""
         self.offsets = {name: torch.zeros(len(tracks[name]), len(avatar.cells), 3) for name in wanted}
         self.fitted = {name: torch.zeros((), dtype=torch.int64) for name in wanted}
+        self.unseen = {
+            name: frozenset(frame for frame in clip if not capture.seen_by(name, frame))
+            for name, clip in wanted.items()
+        }
+        """Frames that no camera saw: their maps carry the cloth on and teach nothing."""
 
     @property
     def complete(self) -> bool:
@@ -87,9 +92,10 @@ class Registration:
         return self.count >= self.longest or self.used >= LIMIT
 
     @property
-    def result(self) -> dict[str, tuple[range, Float[Tensor, "_ p 3"]]]:
+    def result(self) -> dict[str, tuple[Collection[int], Float[Tensor, "_ p 3"]]]:
         """The frames of each sequence that have a map, and the maps at the control points, metres."""
-        frames = {name: range(start, start + int(self.fitted[name])) for name, start in self.starts.items()}
+        fitted = {name: range(start, start + int(self.fitted[name])) for name, start in self.starts.items()}
+        frames = {name: set(each) - self.unseen[name] for name, each in fitted.items()}
         return {name: (frames[name], maps) for name, maps in self.offsets.items() if frames[name]}
 
     @property
@@ -129,7 +135,7 @@ class Registration:
         return self.fit(*place) if place is not None else None
 
     def fit(self, name: str, frame: int) -> Progress | None:
-        """Fit the map of a frame; those of the frames before it are fitted. What no camera saw is guessed."""
+        """Fit the map of a frame; those before it are fitted. Cloth that no camera saw stays as it was."""
         rng = np.random.default_rng([self.seed, self.order.index(name), frame])
         context = self.tracks[name][[frame]]
         guesses, fast = self._guesses(context, name, frame)
@@ -137,7 +143,8 @@ class Registration:
         view = functools.cache(functools.partial(self._view, name, frame, points=points))
         cameras = self.capture.seen_by(name, frame)
         if not cameras:
-            self.offsets[name][frame, self.garment] = guesses[0]
+            if frame > self.starts[name]:
+                self.offsets[name][frame] = self.offsets[name][frame - 1]
             self.fitted[name] += 1
             return None
 

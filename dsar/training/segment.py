@@ -1,6 +1,7 @@
 """One update's worth of work: a segment of K frames of several rollouts, rendered and compared."""
 
 import dataclasses
+import os
 from collections import defaultdict, deque
 from collections.abc import Collection, Mapping
 from concurrent.futures import Future
@@ -72,7 +73,7 @@ class SegmentTrainer:
         lpips: nn.Module | None,
     ) -> None:
         self.config, self.avatar, self.lpips = config, avatar, lpips
-        self.loader = TargetLoader(capture)
+        self.loader = TargetLoader(capture, max(1, (os.cpu_count() or 1) // config.workers))
         self.tracks = {name: avatar.track(capture.motions[name]) for name in clips}
         self.streams = Streams(clips, config.schedule.streams, config.schedule.mirrored)
         self.mirror = (
@@ -81,7 +82,7 @@ class SegmentTrainer:
             else None
         )
         self.state: NetworkState = avatar.start(config.schedule.streams)
-        self.registered: Mapping[str, tuple[range, Tensor]] = {}
+        self.registered: Mapping[str, tuple[Collection[int], Tensor]] = {}
         """Frames that have a registered map, and the maps at the control points, by sequence."""
         self.records: deque[TemporalRecord] = deque(maxlen=3)
         self.speeds: deque[Tensor] = deque(maxlen=max(2, config.model.window))

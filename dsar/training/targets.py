@@ -46,11 +46,11 @@ def load_target(capture: Capture, sequence: str, frame: int, camera_index: int, 
 
 
 class TargetLoader:
-    """Loads views in a thread of its own, while the network computes."""
+    """Loads views in threads of its own, while the network computes."""
 
-    def __init__(self, capture: Capture) -> None:
+    def __init__(self, capture: Capture, threads: int = 1) -> None:
         self.capture = capture
-        self._thread = ThreadPoolExecutor(1, "targets")
+        self._threads = ThreadPoolExecutor(threads, "targets")
 
     def ask(
         self, rng: np.random.Generator, sequence: str, frame: int, reduction: int, count: int
@@ -59,7 +59,7 @@ class TargetLoader:
         seen = self.capture.seen_by(sequence, frame)
         chosen = rng.choice(seen, min(count, len(seen)), replace=False) if seen else ()
         return [
-            self._thread.submit(load_target, self.capture, sequence, frame, int(index), reduction)
+            self._threads.submit(load_target, self.capture, sequence, frame, int(index), reduction)
             for index in chosen
         ]
 

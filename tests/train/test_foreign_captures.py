@@ -2,8 +2,10 @@
 
 import dataclasses
 import json
+import logging
 import math
 import re
+import shutil
 from functools import partial
 
 import layouts
@@ -99,6 +101,25 @@ def test_avatarrex_trains_with_no_flag_but_the_folder(tiny_capture, tmp_path, mo
     main(["eval", str(run), "--json", str(tmp_path / "eval.json"), "--progress", "none"])
     test = json.loads((tmp_path / "eval.json").read_text())["splits"]["test"]
     assert (test["frames"], test["views"]) == (3, 4)
+    main(train_arguments(tmp_path / "take", run, "--steps", "24", "--workers", "1", "--resume"))
+
+
+def test_a_capture_with_gaps_trains_and_is_measured(tiny_capture, tmp_path):
+    """Frames that no camera saw, the stillest among them, and some that some cameras did not see."""
+    root = shutil.copytree(tiny_capture, tmp_path / "gaps")
+    images = root / "images"
+    for camera in range(4):
+        for frame in (0, 1, 5):
+            (images / f"turn/cam{camera}/{frame:04d}.png").unlink()
+    for sequence, camera, frame in (("sway", 2, 0), ("sway", 0, 3), ("bend", 1, 4), ("bend", 1, 7)):
+        (images / f"{sequence}/cam{camera}/{frame:04d}.png").unlink()
+    run = tmp_path / "run"
+    main(train_arguments(root, run, "--steps", "30", "--workers", "1"))
+    main(["eval", str(run), "--json", str(tmp_path / "eval.json"), "--progress", "none"])
+    figures = json.loads((tmp_path / "eval.json").read_text())
+    # Every second of ten frames; cam1 lacks one of them, and is no whole film.
+    assert (figures["splits"]["test"]["frames"], figures["splits"]["test"]["views"]) == (5, 4)
+    assert figures["splits"]["test"]["psnr"] > 10
 
 
 def lengthened(capture, times):
@@ -178,6 +199,7 @@ def test_amass_files_at_any_rate_drive_the_avatar_to_the_same_motion(trained, tm
 
 
 def test_motion_faster_than_training_is_reported_with_frame_numbers(trained, tmp_path, caplog):
+    caplog.set_level(logging.INFO)
     slow = swing(30)
     write_motion(
         tmp_path / "fast.npz", dataclasses.replace(slow, fps=30.0, rotations=slow.rotations * 8), load_body()
@@ -195,6 +217,7 @@ def test_motion_faster_than_training_is_reported_with_frame_numbers(trained, tmp
         ]
     )
     assert "frames are faster than any training" in caplog.text
+    assert "Motion fast: its poses' MMD from training is" in caplog.text
     listed = [int(number) for number in re.findall(r"\b1\d{3}\b", caplog.text.split("m/s): ")[1])]
     assert listed == sorted(set(listed))
     assert 1002 <= listed[0] <= listed[-1] <= 1046

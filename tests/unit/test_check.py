@@ -182,6 +182,15 @@ def tilt(folder):
     (folder / "capture.json").write_text(json.dumps(record))
 
 
+def delay_one(folder):
+    """One camera shows what the others saw three frames before; its first three images are missing."""
+    for camera in folder.glob("*/cam2"):
+        for frame in range(FRAMES - 1, 2, -1):
+            shutil.copy(camera / f"{frame - 3:04d}.png", camera / f"{frame:04d}.png")
+        for frame in range(3):
+            (camera / f"{frame:04d}.png").unlink()
+
+
 def stutter(folder):
     for frame in (5, 9):
         shutil.copy(folder / f"sway/cam2/{frame - 1:04d}.png", folder / f"sway/cam2/{frame:04d}.png")
@@ -203,6 +212,8 @@ FAULTS = {
     "motion_turned_X+90": write_y_up,
     "frame_offset_-2": delay,
     "intrinsics_times_2": edit_intrinsics(lambda K: K * np.array([[2.0], [2.0], [1.0]])),
+    "intrinsics_times_0.5": edit_intrinsics(lambda K: K * np.array([[0.5], [0.5], [1.0]])),
+    "cameras_in_centimetres": edit_extrinsics(lambda T: rigid(T[:3, :3], 100 * T[:3, 3])),
     "half_pixel_+0.5": edit_intrinsics(lambda K: K - HALF),
     "half_pixel_-0.5": edit_intrinsics(lambda K: K + HALF),
     "mirrored_images": edit_images(lambda image: image[:, ::-1]),
@@ -211,16 +222,13 @@ FAULTS = {
     "empty_masks": edit_images(lambda image: np.dstack([image[..., :3], 0 * image[..., 3]])),
     "cameras_swapped": swap,
     "camera_off": tilt,
+    "camera_late": delay_one,
     "duplicate_frames": stutter,
     "broken_images": cut_short,
 }  # fmt: skip
 FATAL = {
-    "masks_inverted",
-    "empty_masks",
-    "broken_images",
-    "camera_to_world",
-    "opengl_axes",
-    "motion_in_millimetres",
+    *("masks_inverted", "empty_masks", "broken_images", "camera_to_world", "opengl_axes"),
+    *("motion_in_millimetres", "cameras_in_centimetres", "intrinsics_times_2", "intrinsics_times_0.5"),
 }
 
 
@@ -247,8 +255,9 @@ def test_a_seeded_fault_is_named(folder, name):
     verdict = check_capture(open_capture(folder))
     found = [finding.name for finding in verdict.findings]
     assert name in found, verdict.findings
-    # Nothing else is accused, but for the other of two exchanged cameras.
-    assert set(found) == {name}
+    # Nothing else is accused, but that the first frames are missing where all images are late.
+    assert set(found) - {"unseen_frames"} == {name}
+    assert ("unseen_frames" in found) == (name == "frame_offset_-2")
     if name in FATAL:
         assert verdict.fatal
     if name in ("frame_offset_-2", "half_pixel_+0.5", "duplicate_frames", "camera_off"):
@@ -292,6 +301,16 @@ def test_a_jump_is_named_with_its_frame(folder):
     assert jumps == [
         f"sequence {name}: the body jumps at frame 9; cut it there" for name in SEQUENCES.values()
     ]
+
+
+def test_images_that_do_not_meet_the_motion_are_no_clean_capture(folder):
+    for path in folder.glob("*/cam*/*.png"):
+        if not 4 <= int(path.stem) <= 6:
+            path.unlink()
+    verdict = check_capture(open_capture(folder))
+    assert [finding.name for finding in verdict.findings] == ["unseen_frames", "unseen_frames"]
+    assert "no camera has an image of 9 of 12 frames: 0, 1, 2, 3, 7 and 4 more" in verdict.findings[0].what
+    assert all(camera.inside > 0.99 for camera in verdict.cameras)
 
 
 def test_the_body_is_drawn_over_the_images(clean):

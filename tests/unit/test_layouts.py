@@ -229,6 +229,7 @@ def test_hands_as_components_need_the_models_own(written, caplog):
         ),
         ("dress", "Take1/SMPLX/mesh-f00012_smplx.pkl", Intruder(), "mesh-f00012_smplx.*is not data"),
         ("dress", "Take2/basic_info.pkl", {"scan_frames": []}, "names of frames"),
+        ("dress", "Take2/basic_info.pkl", {"scan_frames": 7}, "names of frames"),
         ("dress", "Take2/basic_info.pkl", [1], "expected a dictionary, found a list"),
         ("dress", "Take1/SMPLX/mesh-f00013_smplx.pkl", b"\x80", "mesh-f00013_smplx.*cannot be read"),
     ],
@@ -277,6 +278,7 @@ def spoil_fit(root, **changes):
         ({"transl": np.array([0.0, np.nan, 0.0])}, "transl has values that are not finite"),
         ({"left_hand_pose": np.zeros(46)}, "left_hand_pose has 46 numbers"),
         ({"betas": "thin"}, "betas is not made of numbers"),
+        ({"betas": np.zeros(9)}, "betas has 9 numbers, .*mesh-f00011_smplx.* 10"),
     ],
 )
 def test_a_broken_fit_is_refused_with_its_frame(folder, written, changes, message):
@@ -304,6 +306,49 @@ def test_poses_that_are_not_finite_are_refused_with_their_frame(folder):
     )
     with pytest.raises(MotionError, match="has no frames"):
         open_written(root.parent, "avatarrex")
+
+
+@pytest.mark.parametrize("betas", [None, np.zeros((1, 0))])
+def test_a_take_without_a_shape_is_refused(folder, betas):
+    root = folder("avatarrex")
+    with np.load(root / "smpl_params.npz") as file:
+        arrays = {key: file[key] for key in file.files if key != "betas"}
+    np.savez(root / "smpl_params.npz", **arrays, **({} if betas is None else {"betas": betas}))
+    with pytest.raises(CaptureError, match=r"smpl_params\.npz: expected the person's shape as betas"):
+        open_written(root.parent, "avatarrex")
+
+
+def test_takes_that_were_calibrated_apart_are_refused(folder, written):
+    root = folder("dress")
+    path = root / "Take2/Capture/cameras.pkl"
+    cameras = pickle.loads(path.read_bytes())
+    cameras["0028"]["extrinsics"][0, 3] += 0.01
+    path.write_bytes(pickle.dumps(cameras))
+    with pytest.raises(CaptureError, match=r"Take2/Capture/cameras\.pkl: differs from that of Take1"):
+        open_capture(root, body=written / "body.npz")
+    assert open_capture(
+        root / "Take2", body=written / "body.npz", train_frames="0-5", test_frames="6-9"
+    ).cameras
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"faces": np.zeros((0, 3))}, {"faces": np.array(3)}, {"uvs": np.zeros((5, 2))}, {"vertices": None}],
+)
+def test_a_broken_scan_is_named_when_it_is_seen(folder, written, changes):
+    root = folder("dress")
+    path = root / "Take1/Meshes_pkl/mesh-f00013.pkl"
+    path.write_bytes(pickle.dumps(pickle.loads(path.read_bytes()) | changes))
+    capture = open_capture(root, body=written / "body.npz")
+    with pytest.raises(CaptureError, match=r"scan .*mesh-f00013\.pkl: expected"):
+        capture.image("Take1", 2, 5)
+
+
+def test_our_own_captures_take_another_body_and_warn(tiny_capture, written, tmp_path, caplog):
+    shutil.copy(written / "body.npz", tmp_path / "SMPLX_NEUTRAL.npz")
+    capture = open_capture(tiny_capture, body=tmp_path)
+    assert capture.body_path == tmp_path / "SMPLX_NEUTRAL.npz"
+    assert "were fitted with the embedded body" in caplog.text
 
 
 def test_truncated_and_wrongly_sized_images_are_named_when_read(folder):

@@ -13,13 +13,13 @@ from torch import Tensor
 from dsar.body.model import FACE_JOINTS, JOINT_NAMES, Body
 from dsar.body.skinning import forward_kinematics, pose_vertices
 from dsar.data.multiview import MultiViewCapture
-from dsar.geometry.cameras import project, spread_out
+from dsar.geometry.cameras import project
 from dsar.raster.mesh import rasterize_mesh
 from dsar.types import Camera, Motion
 
 COARSE, FINE = 256, 1024
 """Pixels of height to which larger images are reduced, to look for coarse and for fine mistakes."""
-_FRAMES, _CAMERAS = 8, 8
+_FRAMES = 8
 _SAMPLES = 512
 _HANDS = (slice(FACE_JOINTS.stop, FACE_JOINTS.stop + 15), slice(FACE_JOINTS.stop + 15, len(JOINT_NAMES)))
 _REACH = 0.06
@@ -97,20 +97,23 @@ def read(capture: MultiViewCapture) -> Reading:
 
 
 def load_masks(
-    capture: MultiViewCapture, usable: Collection[tuple[str, int, int]], height: int = COARSE
+    capture: MultiViewCapture,
+    usable: Collection[tuple[str, int, int]],
+    height: int = COARSE,
+    cameras: int | None = None,
 ) -> list[Mask]:
-    """Return some masks of the frames in which most moves and of others, evenly spread over the cameras.
+    """Return some masks of the frames in which most moves and of others.
 
     Args:
         capture: Where they are from.
         usable: Sequence, frame and camera of the images that can be read and have a mask.
         height: Pixels to which higher images are reduced, by a whole number.
+        cameras: How many cameras, spread as far as can be; None: all.
     """
-    cameras = spread_out(capture.cameras, min(_CAMERAS, len(capture.cameras)))
-    wanted = {camera.name for camera in cameras}
+    wanted = {camera.name for camera in capture.with_cameras(cameras).cameras}
     chosen = {index for index, camera in enumerate(capture.cameras) if camera.name in wanted}
     masks = []
-    for sequence, frame in choose_frames(capture.motions):
+    for sequence, frame in choose_frames(capture.motions, {place[:2] for place in usable}):
         for index in sorted(k for k in chosen if (sequence, frame, k) in usable):
             alpha = torch.tensor(capture.image(sequence, frame, index)[..., 3]).float() / 255
             reduction = -(-alpha.shape[0] // height)
@@ -120,10 +123,15 @@ def load_masks(
     return masks
 
 
-def choose_frames(motions: Mapping[str, Motion]) -> list[tuple[str, int]]:
-    """Return frames of all sequences: half of them where joints turn fastest, half evenly spread."""
-    places = [(name, frame) for name, motion in motions.items() for frame in range(len(motion))]
-    rates = [rate for motion in motions.values() for rate in _rates(motion)]
+def choose_frames(
+    motions: Mapping[str, Motion], usable: Collection[tuple[str, int]]
+) -> list[tuple[str, int]]:
+    """Return usable frames of all sequences: half of them where joints turn fastest, half evenly spread."""
+    every = {(name, k): rate for name, motion in motions.items() for k, rate in enumerate(_rates(motion))}
+    places = [place for place in every if place in usable]
+    if not places:
+        return []
+    rates = [every[place] for place in places]
     even = np.linspace(0, len(places) - 1, _FRAMES // 2).round().astype(int).tolist()
     fastest = sorted(range(len(places)), key=lambda index: -rates[index])
     apart: list[int] = []

@@ -14,7 +14,7 @@ from torch import Tensor
 from dsar.avatar.track import find_jumps
 from dsar.body.skinning import forward_kinematics
 from dsar.data.multiview import MultiViewCapture
-from dsar.data.speeds import joint_speeds
+from dsar.data.novelty import joint_speeds
 from dsar.errors import CaptureError
 
 _THREADS = 2
@@ -50,13 +50,11 @@ def read_pictures(capture: MultiViewCapture) -> Iterator[Picture]:
             return Picture(*place, b"", 0.0, 0.0, str(error))
         return Picture(*place, blake2b(image.tobytes(), digest_size=16).digest(), *_cover(image[..., 3]))
 
-    places = (
-        (name, frame, index)
-        for name, motion in capture.motions.items()
-        for index in range(len(capture.cameras))
-        for frame in range(len(motion))
-        if index in capture.seen_by(name, frame)
-    )
+    places = []
+    for name, motion in capture.motions.items():
+        seen = [capture.seen_by(name, frame) for frame in range(len(motion))]
+        by_camera = sorted((index, frame) for frame, cameras in enumerate(seen) for index in cameras)
+        places += [(name, frame, index) for index, frame in by_camera]
     with ThreadPoolExecutor(_THREADS) as threads:
         yield from threads.map(load, places)
 

@@ -1,7 +1,6 @@
 """The posed body drawn over a capture's images, to be looked at."""
 
 import dataclasses
-from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -18,19 +17,25 @@ _DIM = 0.35
 
 
 def draw_overlays(
-    capture: MultiViewCapture, cameras: Sequence[int] | None = None
+    capture: MultiViewCapture,
 ) -> tuple[dict[str, list[UInt8[np.ndarray, "h w 3"]]], list[str]]:
     """Return pictures by camera's name, one a frame, and the frames' names.
 
-    The background is dimmed where the mask is empty, the body is orange. White: no image.
+    Where the mask is empty the backdrop is dimmed, or black if the capture has none; the body is orange.
+    White: no image.
     """
-    reading, places = read(capture), choose_frames(capture.motions)
-    chosen = range(len(capture.cameras)) if cameras is None else cameras
+    seen = {
+        (name, frame)
+        for name, motion in capture.motions.items()
+        for frame in range(len(motion))
+        if capture.seen_by(name, frame)
+    }
+    reading, places = read(capture), choose_frames(capture.motions, seen)
     rows = {
         capture.cameras[index].name: [
             _draw(capture, reading.vertices(*place), *place, index) for place in places
         ]
-        for index in chosen
+        for index in range(len(capture.cameras))
     }
     return rows, [f"{name} {frame}" for name, frame in places]
 
@@ -48,6 +53,7 @@ def _draw(
         np.float32
     )
     small = pixels.reshape(height, reduction, width, reduction, 4).mean((1, 3))
-    colors = small[..., :3] * (_DIM + (1 - _DIM) * small[..., 3:] / 255)
+    dim = _DIM if capture.backdrop else 0.0
+    colors = small[..., :3] * (dim + (1 - dim) * small[..., 3:] / 255)
     body = _SHARE * silhouette(vertices, capture.body.faces, whole.resized(width, height)).numpy()[..., None]
     return (colors * (1 - body) + _BODY * body).clip(0, 255).astype(np.uint8)

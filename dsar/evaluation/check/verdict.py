@@ -3,7 +3,7 @@
 import dataclasses
 import statistics
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,9 +13,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dsar.body.files import load_hands
-from dsar.data.divergence import divergence
+from dsar.data.divergence import FAR, NEAR, divergence
 from dsar.data.multiview import MultiViewCapture
-from dsar.data.speeds import joint_speeds
+from dsar.data.novelty import joint_speeds
 from dsar.errors import BodyError, CaptureError
 from dsar.evaluation.check import content
 from dsar.evaluation.check.agreement import (
@@ -43,6 +43,14 @@ APART = 0.5
 """Share of the body in the masks below which a capture cannot train."""
 POOR = 0.9
 """And below which something is likely wrong."""
+_GROSS = 0.1
+"""Error by which a mistake may not be outdone if the capture is to train."""
+_FINE_CAMERAS = 8
+_UNUSUAL = (1.3, 0.03)
+"""How many times the median camera's error one must have to be suspect, and how much more."""
+_MENDED = 0.5
+"""Share of an error below which its cause is found."""
+_LATEST = 5
 _LISTED = 5
 Reporter = Callable[[str, float], None]
 """Is told what is being done, and the share of it that is done."""
@@ -113,13 +121,15 @@ def check_capture(capture: MultiViewCapture, report: Reporter = lambda *_: None)
     figures |= _describe(capture, pictures)
     report("compare body and masks", 0.8)
     usable = {(p.sequence, p.frame, p.camera) for p in readable if p.coverage > 0}
+    findings += _judge_gaps(capture, {(picture.sequence, picture.frame) for picture in readable})
     masks, reading = load_masks(capture, usable), read(capture)
     agreements = list(compare(reading, masks))
     if masks and not any(finding.name == "masks_inverted" for finding in findings):
         findings += _judge_agreement(capture, reading, masks, agreements)
         report("look for fine mistakes", 0.95)
         if not any(finding.fatal for finding in findings):
-            findings += _judge_details(capture, reading, load_masks(capture, usable, FINE))
+            some = min(_FINE_CAMERAS, len(capture.cameras))
+            findings += _judge_details(capture, reading, load_masks(capture, usable, FINE, some))
     # In other units every step is a jump.
     if not any(finding.name.startswith("motion_in") for finding in findings):
         findings += [
@@ -127,6 +137,19 @@ def check_capture(capture: MultiViewCapture, report: Reporter = lambda *_: None)
             for name, frames in content.count_jumps(capture).items()
         ]
     return Verdict(_by_camera(capture, masks, agreements, pictures), findings, figures)
+
+
+def _judge_gaps(capture: MultiViewCapture, seen: Collection[tuple[str, int]]) -> list[Finding]:
+    """Return which sequences have frames that no camera saw."""
+    findings = []
+    for name, motion in capture.motions.items():
+        unseen = [frame for frame in range(len(motion)) if (name, frame) not in seen]
+        if unseen:
+            what = f"sequence {name}: no camera has an image of {len(unseen)} of {len(motion)} frames: "
+            advice = "; they are done without; if they are many, do motion and images belong together?"
+            everything = len(unseen) == len(motion)
+            findings.append(Finding("unseen_frames", what + _list(unseen) + advice, everything))
+    return findings
 
 
 def _judge_pictures(capture: MultiViewCapture, pictures: Sequence[content.Picture]) -> list[Finding]:
@@ -181,7 +204,9 @@ def _judge_agreement(
     before = np.array([each.error for each in agreements])
     suspect = find_mistake(reading, masks, coarse_mistakes(capture.turn), before)
     apart = inside < APART
-    findings = [_of_suspect(suspect, apart)] if suspect else []
+    # A body that is drawn too small lies in the mask, and is as wrong as one beside it.
+    gross = suspect is not None and not suspect.mistake.shift and suspect.before - suspect.after > _GROSS
+    findings = [_of_suspect(suspect, apart or gross)] if suspect else []
     if suspect is None or suspect.mistake.name.startswith("frame_offset"):
         findings += _judge_cameras(capture, reading, masks, before)
     if not findings and inside < POOR:
@@ -206,21 +231,28 @@ def _judge_cameras(
     usual = statistics.median(means.values())
     findings = []
     for camera, mean in means.items():
-        if mean < 1.5 * usual or mean < usual + 0.1:
+        if mean < _UNUSUAL[0] * usual or mean < usual + _UNUSUAL[1]:
             continue
         own = [mask for mask in masks if mask.camera == camera]
+        late = {k: errors(reading, own, k).mean() for k in range(-_LATEST, _LATEST + 1)}
         others = {
             k: errors(dataclasses.replace(reading, cameras={camera: reading.cameras[k]}), own).mean()
             for k in reading.cameras
             if k != camera
         }
         best = min(others, key=lambda k: others[k])
+        shift = min(late, key=lambda k: late[k])
         name = capture.cameras[camera].name
-        if others[best] < 0.5 * mean:
+        if others[best] < _MENDED * mean and others[best] < late[shift]:
             what = f"the images of {name} are those of {capture.cameras[best].name}: exchange their folders"
             findings.append(Finding("cameras_swapped", what))
+        elif shift and late[shift] - usual < _MENDED * (mean - usual):
+            how = f"{abs(shift)} frames {'ahead' if shift > 0 else 'late'}"
+            findings.append(
+                Finding("camera_late", f"the images of {name} are {how}: number them as the others")
+            )
         else:
-            what = f"{name} disagrees with the others: calibrate it anew, or leave it out (it may run late)"
+            what = f"{name} disagrees with the others: calibrate it anew, or leave it out"
             findings.append(Finding("camera_off", what))
     return findings
 
@@ -262,7 +294,8 @@ def _describe(capture: MultiViewCapture, pictures: Sequence[content.Picture]) ->
     for name in splits["test"]:
         if len(capture.motions[name]) > 1:
             found = divergence(capture.motions, splits["train"], [name])
-            divergences[name] = {"mmd": found, "mmd_squared": found**2}
+            label = "near" if found < NEAR else "far" if found > FAR else "between"
+            divergences[name] = {"mmd": found, "mmd_squared": found**2, "label": label}
     return {
         "frames": {name: len(motion) for name, motion in capture.motions.items()},
         "fps": capture.fps,

@@ -2,8 +2,10 @@
 
 import dataclasses
 import json
+import multiprocessing
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -166,12 +168,21 @@ class Study:
             "seed": model.seed,
             **provenance,
         }
-        found |= {"updates": read_progress(run)["step"], **evaluate(avatar, capture, streams=streams)}
-        if not each.zeroed:
-            far = (capture.splits.get("fd") or capture.splits["test"])[0]
-            verdicts = stress(avatar, capture.motions[far])
-            found["stress"] = {name: verdict.to_json() for name, verdict in verdicts}
+        # The battery needs no more than one core and is over when `evaluate` comes to measure times.
+        with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as other:
+            battery = None if each.zeroed else other.submit(_stress, run.folder)
+            found |= {"updates": read_progress(run)["step"], **evaluate(avatar, capture, streams=streams)}
+            if battery is not None:
+                found["stress"] = battery.result()
         write_whole(self._figures(each), json.dumps(found, indent=1) + "\n")
+
+
+def _stress(folder: Path) -> dict[str, Any]:
+    """Return the verdicts on a run, by case."""
+    avatar, config, _ = load_checkpoint(Run(folder))
+    capture = capture_of(config)
+    far = (capture.splits.get("fd") or capture.splits["test"])[0]
+    return {name: verdict.to_json() for name, verdict in stress(avatar, capture.motions[far])}
 
 
 def _follow(report: Reporter, what: str, done: int, needed: int, line: Report) -> None:

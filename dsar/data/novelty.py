@@ -1,7 +1,7 @@
-"""How fast a body moves, and whether the avatar has seen the like."""
+"""Whether an avatar has seen the like of a motion: its poses and its speed."""
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import torch
 from jaxtyping import Float
@@ -9,6 +9,7 @@ from torch import Tensor
 
 from dsar.body.model import Body
 from dsar.body.skinning import forward_kinematics
+from dsar.data.divergence import FAR, NEAR, divergence
 from dsar.types import Motion
 
 USUAL = 0.999
@@ -31,8 +32,22 @@ def unusual_frames(body: Body, motion: Motion, known: Iterable[Motion]) -> tuple
     return [int(frame) + 1 for frame in (joint_speeds(body, motion) > limit).nonzero()], limit
 
 
-def warn_of_speed(body: Body, motion: Motion, known: Iterable[Motion], first: int) -> None:
-    """Log where a motion is faster than what an avatar was trained with; `first` numbers its first frame."""
+def report_novelty(body: Body, motion: Motion, known: Sequence[Motion], first: int) -> None:
+    """Log how far a motion's poses are from training, and where it is faster than any of it.
+
+    Args:
+        body: Whose body moves.
+        motion: What is new.
+        known: What the avatar was trained with.
+        first: Number of the motion's first frame.
+    """
+    if len(motion) > 1 and sum(map(len, known)) > 1:
+        motions = {str(index): each for index, each in enumerate(known)}
+        distance = divergence(motions | {"new": motion}, list(motions), ["new"])
+        LOGGER.info(
+            "Motion %s: its poses' MMD from training is %.2f (near below %g, far above %g)",
+            *(motion.name, distance, NEAR, FAR),
+        )
     frames, limit = unusual_frames(body, motion, known)
     if frames:
         some = ", ".join(str(first + frame) for frame in frames[:_LISTED])
