@@ -50,9 +50,9 @@ def test_a_row_that_names_no_setting_is_refused(tmp_path):
         study.config(runner.Model({"model.windows": 3}, 0))
 
 
-def test_a_study_goes_on_with_what_is_missing_and_does_nothing_twice(tiny_capture, tmp_path, monkeypatch):
-    monkeypatch.setattr(runner, "stress", lambda *of: iter([("causal", run_causal(*of))]))
-    study, tables = Study(tmp_path, 0.05, str(tiny_capture)), list(TINY.values())
+def test_a_study_goes_on_with_what_is_missing_and_does_nothing_twice(tiny_capture, tmp_path):
+    study = Study(tmp_path, 0.05, str(tiny_capture), cases={"causal": run_causal})
+    tables = list(TINY.values())
     # An hour's budget of none: nothing is begun.
     assert not study.run(tables, hours=0.0)
     assert summarize_tables(study, TINY)["tiny"]["rows"][0]["seeds"] == []

@@ -6,7 +6,7 @@ import multiprocessing
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from dsar.config import PRESETS, TrainConfig, config_to_json
 from dsar.data.capture import capture_of
 from dsar.errors import ConfigError
 from dsar.evaluation.heldout import evaluate
-from dsar.evaluation.stress import stress
+from dsar.evaluation.stress import CASES, Case, stress
 from dsar.evaluation.study.tables import Row, Table
 from dsar.network import STREAMS, Stream
 from dsar.training.checkpoint import Run, load_checkpoint, read_progress, write_whole
@@ -64,6 +64,8 @@ class Study:
     """A capture folder, or `embedded`."""
     preset: str = "demo"
     """What the settings of a row start from."""
+    cases: Mapping[str, Case] = field(default_factory=lambda: CASES)
+    """The stability battery that every model runs."""
 
     def measurements(self, tables: Sequence[Table]) -> list[Measurement]:
         """Return what the tables need, first seeds first."""
@@ -170,19 +172,19 @@ class Study:
         }
         # The battery needs no more than one core and is over when `evaluate` comes to measure times.
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as other:
-            battery = None if each.zeroed else other.submit(_stress, run.folder)
+            battery = None if each.zeroed else other.submit(_stress, run.folder, self.cases)
             found |= {"updates": read_progress(run)["step"], **evaluate(avatar, capture, streams=streams)}
             if battery is not None:
                 found["stress"] = battery.result()
         write_whole(self._figures(each), json.dumps(found, indent=1) + "\n")
 
 
-def _stress(folder: Path) -> dict[str, Any]:
+def _stress(folder: Path, cases: Mapping[str, Case]) -> dict[str, Any]:
     """Return the verdicts on a run, by case."""
     avatar, config, _ = load_checkpoint(Run(folder))
     capture = capture_of(config)
     far = (capture.splits.get("fd") or capture.splits["test"])[0]
-    return {name: verdict.to_json() for name, verdict in stress(avatar, capture.motions[far])}
+    return {name: verdict.to_json() for name, verdict in stress(avatar, capture.motions[far], cases)}
 
 
 def _follow(report: Reporter, what: str, done: int, needed: int, line: Report) -> None:
