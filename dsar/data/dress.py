@@ -92,7 +92,7 @@ def open_dress(root: Path, opening: Opening) -> MultiViewCapture:
     fits = [_read_fits(folder, scan.frames, hands) for folder, scan in zip(folders, scans, strict=True)]
     virtual = []
     if all(scan.complete for scan in scans):
-        turn = upright(root.name, [motion for motion, _ in fits])
+        turn = upright(str(root), [motion for motion, _ in fits])
         ring = virtual_cameras([turn_camera(c, turn) for c in released], turn.numpy() @ scans[0].center)
         virtual = [turn_camera(camera, turn.T) for camera in ring]
     takes = []

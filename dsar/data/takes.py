@@ -87,12 +87,12 @@ def make_capture(
         CaptureError: nothing is left to train with, or images are missing altogether.
         BodyError: the body file is not usable.
     """
-    body, path = fitted_body(name, opening.body, betas, gender)
-    turn = upright(name, [take.motion for take in takes])
+    body, path = fitted_body(str(root), opening.body, betas, gender)
+    turn = upright(str(root), [take.motion for take in takes])
     cameras = [turn_camera(camera, turn) for camera in cameras]
     for take in takes:
-        _count_images(f"capture {name}, {take.motion.name}", cameras, take)
-    parts, splits = _split(name, takes, opening)
+        _count_images(f"capture {root}, {take.motion.name}", cameras, take)
+    parts, splits = _split(str(root), takes, opening)
     motions, starts, views = {}, {}, {}
     for key, (take, frames) in parts.items():
         motion = turn_motion(take.motion.slice(frames.start, frames.stop), body, turn)

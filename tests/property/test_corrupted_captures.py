@@ -60,7 +60,12 @@ def read_all(root, name):
                 assert capture.image(sequence, frame, camera).shape[2] == 4
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=60,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
 @given(
     name=st.sampled_from(NAMES),
     pick=st.floats(0, 1, exclude_max=True),
