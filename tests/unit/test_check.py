@@ -352,6 +352,14 @@ def test_the_command_prints_writes_and_exits(clean, folder, tmp_path, capsys):
     assert "CANNOT TRAIN opengl_axes: the cameras' axes are OpenGL's" in capsys.readouterr().out
 
 
+def test_broken_images_do_not_stop_the_sheet(folder):
+    for path in folder.glob("sway/cam1/*.png"):
+        path.write_bytes(path.read_bytes()[:200])
+    rows, _ = draw_overlays(open_capture(folder))
+    assert (rows["cam1"][0] == 255).all()
+    assert not (rows["cam0"][0] == 255).all()
+
+
 def test_a_capture_without_a_readable_image_is_refused(folder):
     for path in folder.glob("*/cam*/*.png"):
         data = path.read_bytes()

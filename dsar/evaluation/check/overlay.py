@@ -7,6 +7,7 @@ import torch
 from jaxtyping import UInt8
 
 from dsar.data.multiview import MultiViewCapture
+from dsar.errors import CaptureError
 from dsar.evaluation.check.agreement import choose_frames, read, silhouette
 
 HEIGHT = 360
@@ -22,7 +23,7 @@ def draw_overlays(
     """Return pictures by camera's name, one a frame, and the frames' names.
 
     Where the mask is empty the backdrop is dimmed, or black if the capture has none; the body is orange.
-    White: no image.
+    White: no image that can be read.
     """
     seen = {
         (name, frame)
@@ -46,12 +47,16 @@ def _draw(
     camera = capture.cameras[index]
     reduction = -(-camera.height // HEIGHT)
     height, width = camera.height // reduction, camera.width // reduction
+    white = np.full((height, width, 3), 255, np.uint8)
     if index not in capture.seen_by(sequence, frame):
-        return np.full((height, width, 3), 255, np.uint8)
+        return white
+    try:
+        image = capture.image(sequence, frame, index)
+    except CaptureError:
+        # The verdict names it; the others are still to be looked at.
+        return white
     whole = dataclasses.replace(camera, width=width * reduction, height=height * reduction)
-    pixels = capture.image(sequence, frame, index)[: height * reduction, : width * reduction].astype(
-        np.float32
-    )
+    pixels = image[: height * reduction, : width * reduction].astype(np.float32)
     small = pixels.reshape(height, reduction, width, reduction, 4).mean((1, 3))
     dim = _DIM if capture.backdrop else 0.0
     colors = small[..., :3] * (dim + (1 - dim) * small[..., 3:] / 255)
