@@ -4,7 +4,7 @@ BIN := .venv/bin
 STAMP := .venv/.installed
 RUN ?= runs/demo
 
-.PHONY: demo test lint clean
+.PHONY: demo test interop interop-tools lint clean
 .DELETE_ON_ERROR:
 
 demo: $(STAMP)
@@ -15,6 +15,13 @@ demo: $(STAMP)
 test: $(STAMP)
 	$(BIN)/pytest
 
+# Blender, a splat converter and a web viewer of others, in which our files are tried; about 1.3 GB.
+interop: $(STAMP)
+	-$(MAKE) -k interop-tools
+	$(BIN)/pytest tests/interop -rs
+
+interop-tools: .interop/.blender .interop/.node
+
 lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -22,8 +29,22 @@ lint: $(STAMP)
 	$(BIN)/pyright
 
 clean:
-	rm -rf .venv runs dist .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf .venv .interop runs dist .pytest_cache .ruff_cache .hypothesis .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# Blender's module wants an older numpy than we do, so it gets an environment of its own.
+.interop/.blender:
+	@echo "Setting up Blender in .interop"
+	@$(PYTHON) -m venv .interop/blender
+	@.interop/blender/bin/pip install -qq 'bpy==4.5.15' 'numpy<2'
+	@touch $@
+
+.interop/.node:
+	@echo "Setting up a splat converter and a viewer in .interop"
+	@mkdir -p .interop
+	@npm install --prefix .interop --silent --no-save --no-audit --no-fund --ignore-scripts \
+	  @playcanvas/splat-transform@2.7.1 @sparkjsdev/spark@2.2.0 three@0.187.0 playwright-core@1.65.1
+	@touch $@
 
 # torch first and alone: a CPU wheel that pip already knows of, else the one on PyTorch's own index.
 $(STAMP): pyproject.toml constraints.txt

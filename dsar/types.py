@@ -122,6 +122,39 @@ class Motion:
 
 
 @dataclass(frozen=True)
+class Body:
+    """One person's body in the rest T-pose: Y up, facing +Z, left hand at +X, metres.
+
+    The origin is the file's own (near the pelvis), so the feet are below y = 0.
+    """
+
+    vertices: Float[Tensor, "v 3"]
+    """Shaped rest vertices."""
+    faces: Int[Tensor, "t 3"]
+    """Triangles as vertex indices, counter-clockwise seen from outside."""
+    joints: Float[Tensor, "j 3"]
+    """Shaped rest joints in SMPL-X's published order."""
+    parents: tuple[int, ...]
+    """Parent of each joint, always before its child; -1 at the pelvis."""
+    weights: Float[Tensor, "v j"]
+    """Skinning weights; every row sums to 1."""
+    uv: Float[Tensor, "u 2"]
+    """Texture coordinates in [0, 1], origin at the bottom left."""
+    uv_faces: Int[Tensor, "t 3"]
+    """The same triangles as indices into `uv`."""
+
+    def to(self, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> "Body":
+        """Return the body on another device, or with its real-valued fields in another precision."""
+        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        moved = {
+            name: value.to(device=device, dtype=dtype if value.is_floating_point() else None)
+            for name, value in fields.items()
+            if isinstance(value, Tensor)
+        }
+        return dataclasses.replace(self, **moved)
+
+
+@dataclass(frozen=True)
 class Contributors:
     """Which Gaussians made every pixel of an image: as many as blended there, pixel after pixel, row by row.
 
@@ -156,6 +189,25 @@ class RenderOutput:
 
 
 @dataclass(frozen=True)
+class Binding:
+    """What Gaussians hang on at rest, and how it moves: enough to bind them again in another application."""
+
+    body: Body
+    """The body at rest."""
+    joint_names: tuple[str, ...]
+    """Names of its joints."""
+    points: Float[Tensor, "n 3"]
+    """Rest position of each Gaussian's texel, metres: without what the network adds."""
+    weights: Float[Tensor, "n j"]
+    """Skin weights of each Gaussian; rows sum to 1."""
+    uv: Float[Tensor, "n 2"]
+    """Place of each Gaussian on the body's texture, origin at the bottom left; charts of garments lie
+    below it, at v < 0."""
+    T_world_rest: Float[Tensor, "f j 4 4"]
+    """By frame of the sequence: where each joint carries points of the rest pose."""
+
+
+@dataclass(frozen=True)
 class GaussianSequence:
     """A rollout: a fixed set of Gaussians over time, made frame by frame as it is iterated."""
 
@@ -169,6 +221,8 @@ class GaussianSequence:
     """Starts a fresh pass and yields one Gaussians per frame number."""
     provenance: Mapping[str, str] = field(default_factory=dict)
     """Where the frames come from: checkpoint hash, motion, version. Written into every file."""
+    binding: Binding | None = field(default=None, repr=False)
+    """The body that carries the Gaussians, if there is one."""
 
     def __len__(self) -> int:
         """Return the number of frames."""

@@ -144,3 +144,41 @@ def trained(tiny_capture, tmp_path_factory) -> Path:
     figures = out.parent / "train.json"
     main(train_arguments(tiny_capture, out, "--steps", "120", "--workers", "1", "--json", str(figures)))
     return out
+
+
+@pytest.fixture(scope="session")
+def figure():
+    """A coloured body that turns and bends, all of whose Gaussians change in every frame."""
+    from dsar.avatar.avatar import Avatar
+    from dsar.avatar.rollout import roll_out
+    from dsar.body.atlas import Atlas, body_chart
+    from dsar.body.files import load_body
+    from dsar.config import ModelConfig
+    from dsar.types import Motion
+
+    torch.manual_seed(0)
+    config = ModelConfig(channels=(8, 16), heads=2, window=3, memory=2)
+    avatar = Avatar(load_body(), Atlas.stack([body_chart(load_body(), 48)]), config, 24.0)
+    torch.nn.init.normal_(avatar.network.decoder.head.weight, std=0.02)
+    with torch.no_grad():
+        # Red grows to the left hand, green to the head: what is mirrored or upside down shows.
+        place = (avatar.texel_positions - avatar.texel_positions.amin(0)) / torch.tensor([1.8, 1.8, 1.0])
+        place[:, 2] = 0.3
+        avatar.template.harmonics.copy_(((place - 0.5) / 0.28209479)[:, None])
+        avatar.template.opacity_logits.fill_(4.0)
+    t = torch.arange(6) / 24
+    rotations, translations = torch.zeros(6, 55, 3), torch.zeros(6, 3)
+    rotations[:, 16, 2], rotations[:, 17, 2] = -0.8, 0.5
+    rotations[:, 0, 1], rotations[:, 3, 0] = 0.4 + 2 * t, t
+    translations[:, 0] = 0.5 * t
+    return roll_out(avatar.eval(), Motion(rotations, translations, 24.0, "turn"), provenance={"run": "test"})
+
+
+@pytest.fixture(scope="session")
+def front():
+    """A camera that sees all of the figure, with an off-centre principal point."""
+    from dsar.geometry.cameras import look_at
+    from dsar.types import Camera
+
+    K = torch.tensor([[300.0, 0.0, 100.0], [0.0, 300.0, 130.0], [0.0, 0.0, 1.0]])
+    return Camera(K, look_at(np.array([0.3, 0.2, 3.2]), np.array([0.0, -0.2, 0.0])), 192, 256, "front")

@@ -20,8 +20,8 @@ from capture.pack import write_capture
 from PIL import Image
 
 from dsar.body.files import EMBEDDED_BODY, load_body
-from dsar.body.model import Body
 from dsar.body.skinning import forward_kinematics
+from dsar.types import Body
 
 ROOT = Path(__file__).resolve().parents[1]
 SEED, PRINT_SEED = 7, 5

@@ -14,13 +14,13 @@ from dsar.avatar.stillness import stillest_frames
 from dsar.avatar.template import SHOWN, GaussianParameters
 from dsar.avatar.track import find_jumps, make_track
 from dsar.body.atlas import Atlas, body_chart
-from dsar.body.model import PARENTS, Body
+from dsar.body.model import PARENTS
 from dsar.body.skinning import forward_kinematics
 from dsar.config import AtlasConfig, ModelConfig
 from dsar.geometry.rotations import heading_matrix
 from dsar.network import STREAMS, DualStreamNetwork, NetworkOutput, NetworkState, Stream
 from dsar.network.maps import FrameMaps, maps_from_points
-from dsar.types import Capture, Gaussians, Motion
+from dsar.types import Body, Capture, Gaussians, Motion
 
 _log = logging.getLogger(__name__)
 _FAMILIAR = 2.0

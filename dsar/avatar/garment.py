@@ -12,9 +12,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from dsar.body.atlas import Chart, surface_frames
-from dsar.body.model import JOINT_NAMES, Body
+from dsar.body.model import JOINT_NAMES
 from dsar.geometry.cameras import project
-from dsar.types import Capture
+from dsar.types import Body, Capture
 
 LOGGER = logging.getLogger(__name__)
 

@@ -8,10 +8,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dsar.avatar.avatar import Avatar
+from dsar.body.model import JOINT_NAMES
+from dsar.body.skinning import forward_kinematics
 from dsar.errors import MotionError
 from dsar.network import STREAMS, NetworkOutput, Stream
 from dsar.network.streaming import Rollout
-from dsar.types import Gaussians, GaussianSequence, Motion
+from dsar.types import Binding, Gaussians, GaussianSequence, Motion
 
 START_FRAME = 1001
 """Number of a motion's first frame, as film pipelines count."""
@@ -53,6 +55,26 @@ def roll_out(
         num_gaussians=avatar.num_gaussians,
         produce=lambda: _produce(avatar, motion, {n - START_FRAME for n in numbers}, streams),
         provenance={"motion": motion.name, **(provenance or {})},
+        binding=_bind(avatar, motion, numbers),
+    )
+
+
+def _bind(avatar: Avatar, motion: Motion, numbers: Sequence[int]) -> Binding:
+    """Return how the avatar hangs on its body in some frames of a motion."""
+    poses = motion.rotations.to(avatar.body_joints), motion.translations.to(avatar.body_joints)
+    transforms = forward_kinematics(avatar.body, *poses)
+    width = avatar.atlas_size[1]
+    rows, columns = avatar.texels // width, avatar.texels % width
+    # The body's chart is a square; charts of garments lie below it.
+    uv = torch.stack([(columns + 0.5) / width, 1 - (rows + 0.5) / width], -1)
+    # Writers work on the CPU, whatever the avatar does.
+    return Binding(
+        body=avatar.body.to(device="cpu"),
+        joint_names=JOINT_NAMES,
+        points=avatar.texel_positions.cpu(),
+        weights=avatar.texel_weights.cpu(),
+        uv=uv.cpu(),
+        T_world_rest=transforms[[number - START_FRAME for number in numbers]].cpu(),
     )
 
 

@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from dsar.body.model import Body
 from dsar.errors import BodyError
+from dsar.types import Body
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from dsar.body.model import FACE_JOINTS, HEAD, JOINT_NAMES, PARENTS, Body
+from dsar.body.model import FACE_JOINTS, HEAD, JOINT_NAMES, PARENTS
 from dsar.errors import BodyError
 from dsar.pickles import PICKLE_ERRORS, read_pickle
+from dsar.types import Body
 
 EMBEDDED_BODY = Path(__file__).parent / "data" / "body.npz"
 """The body that comes with the package: an adult woman made from MakeHuman's CC0 data."""

@@ -1,11 +1,4 @@
-"""A shaped body at rest: what skinning, texels and renderers read."""
-
-import dataclasses
-from dataclasses import dataclass
-
-import torch
-from jaxtyping import Float, Int
-from torch import Tensor
+"""The skeleton of SMPL-X, which every body and motion uses."""
 
 _FINGER_NAMES = ("index", "middle", "pinky", "ring", "thumb")
 
@@ -28,36 +21,3 @@ PARENTS: tuple[int, ...] = (
 HEAD = JOINT_NAMES.index("head")
 FACE_JOINTS = range(JOINT_NAMES.index("jaw"), JOINT_NAMES.index("jaw") + 3)
 """Jaw and eyes: the joints that SMPL-X has and SMPL-H has not."""
-
-
-@dataclass(frozen=True)
-class Body:
-    """One person's body in the rest T-pose: Y up, facing +Z, left hand at +X, metres.
-
-    The origin is the file's own (near the pelvis), so the feet are below y = 0.
-    """
-
-    vertices: Float[Tensor, "v 3"]
-    """Shaped rest vertices."""
-    faces: Int[Tensor, "t 3"]
-    """Triangles as vertex indices, counter-clockwise seen from outside."""
-    joints: Float[Tensor, "j 3"]
-    """Shaped rest joints in the order of `JOINT_NAMES`."""
-    parents: tuple[int, ...]
-    """Parent of each joint, always before its child; -1 at the pelvis."""
-    weights: Float[Tensor, "v j"]
-    """Skinning weights; every row sums to 1."""
-    uv: Float[Tensor, "u 2"]
-    """Texture coordinates in [0, 1], origin at the bottom left."""
-    uv_faces: Int[Tensor, "t 3"]
-    """The same triangles as indices into `uv`."""
-
-    def to(self, *, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> "Body":
-        """Return the body on another device, or with its real-valued fields in another precision."""
-        fields = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        moved = {
-            name: value.to(device=device, dtype=dtype if value.is_floating_point() else None)
-            for name, value in fields.items()
-            if isinstance(value, Tensor)
-        }
-        return dataclasses.replace(self, **moved)

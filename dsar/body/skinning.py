@@ -9,9 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dsar.body.model import Body
 from dsar.geometry.rotations import matrix_from_axis_angle
-from dsar.types import Pose
+from dsar.types import Body, Pose
 
 
 def forward_kinematics(

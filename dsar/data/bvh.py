@@ -13,10 +13,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dsar.body.model import JOINT_NAMES, Body
+from dsar.body.model import JOINT_NAMES
 from dsar.errors import MotionError
 from dsar.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
-from dsar.types import Motion
+from dsar.types import Body, Motion
 
 _SIDES = (("left", "Left"), ("right", "Right"))
 COUNTERPARTS = {

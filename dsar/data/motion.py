@@ -13,12 +13,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dsar.body.model import Body
 from dsar.data.bvh import read_bvh
 from dsar.data.poses import read_arrays, read_poses, read_rate
 from dsar.errors import MotionError
 from dsar.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
-from dsar.types import Motion
+from dsar.types import Body, Motion
 
 EMBEDDED_MOTIONS = Path(__file__).parent / "embedded_motion"
 """Clips that come with the package, from the CMU motion capture database (mocap.cs.cmu.edu)."""

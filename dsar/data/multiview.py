@@ -12,12 +12,11 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from dsar.body.model import Body
 from dsar.data.frames import parse_range
 from dsar.data.images import ROOM
 from dsar.errors import CaptureError, ConfigError
 from dsar.geometry.cameras import spread_out
-from dsar.types import Camera, Motion
+from dsar.types import Body, Camera, Motion
 
 
 @runtime_checkable

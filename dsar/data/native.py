@@ -16,13 +16,12 @@ from jaxtyping import UInt8
 from PIL import Image, UnidentifiedImageError
 
 from dsar.body.files import choose_body, load_body
-from dsar.body.model import Body
 from dsar.data.calibration import make_camera
 from dsar.data.images import decode_rgba
 from dsar.data.motion import read_motion
 from dsar.data.multiview import MultiViewCapture, OneToMany
 from dsar.errors import CaptureError
-from dsar.types import Camera, Motion
+from dsar.types import Body, Camera, Motion
 
 RECORD_NAME = "capture.json"
 FORMAT, VERSION = "dsar-capture", 1

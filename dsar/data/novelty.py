@@ -7,10 +7,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dsar.body.model import Body
 from dsar.body.skinning import forward_kinematics
 from dsar.data.divergence import FAR, NEAR, divergence
-from dsar.types import Motion
+from dsar.types import Body, Motion
 
 USUAL = 0.999
 """Share of the training frames that is slower than what counts as fast."""

@@ -12,14 +12,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dsar.body.files import choose_body, load_body
-from dsar.body.model import Body
 from dsar.data.divergence import label_sequences
 from dsar.data.frames import parse_range
 from dsar.data.motion import turn_motion
 from dsar.data.multiview import MultiViewCapture, Views
 from dsar.errors import CaptureError
 from dsar.geometry.rotations import matrix_from_axis_angle
-from dsar.types import Camera, Motion
+from dsar.types import Body, Camera, Motion
 
 GAP = 40
 """Frames of a take that are left out between training and test: as many as any of our networks remembers

@@ -7,10 +7,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dsar.body.model import Body
 from dsar.data.motion import turn_motion
 from dsar.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
-from dsar.types import Motion
+from dsar.types import Body, Motion
 
 
 def turning(motion: Motion, yaw: Float[Tensor, " f"]) -> Motion:

@@ -27,9 +27,10 @@ from torch import Tensor
 
 from dsar.avatar.avatar import Avatar
 from dsar.body.atlas import Atlas
-from dsar.body.model import PARENTS, Body
+from dsar.body.model import PARENTS
 from dsar.config import TrainConfig, config_from_json
 from dsar.errors import CheckpointError, ConfigError
+from dsar.types import Body
 
 FORMAT_VERSION = 3
 _BODY = ("vertices", "faces", "joints", "weights", "uv", "uv_faces")

@@ -1,12 +1,40 @@
 """Delivery: a rollout or an image in the formats of film and game pipelines.
 
 Each writer takes a `GaussianSequence` or a `RenderOutput` and nothing else; formats' own libraries are
-imported when a writer runs, never before. Frame numbers are the same in every format.
+imported when a writer runs, never before. Frame numbers are the same in every format. `export` writes any
+mix of formats from one rollout.
 """
 
+from dsar_exporters.delivery import Delivered, Output, export
 from dsar_exporters.exr import exr_path, write_exr
 from dsar_exporters.frames import parse_frames
-from dsar_exporters.ply import read_ply, write_ply
-from dsar_exporters.usd import write_usd
+from dsar_exporters.inspection import find_faults
+from dsar_exporters.splats import (
+    CompressedPlySequence,
+    GltfSnapshot,
+    PlySequence,
+    SpzSequence,
+    read_ply,
+    read_splats,
+    write_ply,
+)
+from dsar_exporters.usd import UsdAsset, write_usd
 
-__all__ = ["exr_path", "parse_frames", "read_ply", "write_exr", "write_ply", "write_usd"]
+__all__ = [
+    "CompressedPlySequence",
+    "Delivered",
+    "GltfSnapshot",
+    "Output",
+    "PlySequence",
+    "SpzSequence",
+    "UsdAsset",
+    "export",
+    "exr_path",
+    "find_faults",
+    "parse_frames",
+    "read_ply",
+    "read_splats",
+    "write_exr",
+    "write_ply",
+    "write_usd",
+]

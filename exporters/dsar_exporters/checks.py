@@ -11,6 +11,8 @@ from dsar.types import Camera, Gaussians, GaussianSequence
 
 _IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _HARMONICS_COUNTS = (1, 4, 9, 16)
+_UNIT = 1e-3
+"""How far a quaternion's length may be from 1."""
 
 
 def check_name(what: str, name: str) -> None:
@@ -23,6 +25,16 @@ def check_name(what: str, name: str) -> None:
         raise ExportError(
             f"{what}: expected letters, digits and _ (no leading digit), found {name!r}: rename it"
         )
+
+
+def check_file_name(what: str, name: str) -> None:
+    """Check that a name can be the first part of file names.
+
+    Raises:
+        ExportError: It is empty or holds a slash.
+    """
+    if not name or any(separator in name for separator in "/\\"):
+        raise ExportError(f"{what}: expected a name without / or \\, found {name!r}: rename it")
 
 
 def check_cameras(cameras: Sequence[Camera]) -> None:
@@ -42,7 +54,8 @@ def check_sequence(sequence: GaussianSequence) -> None:
     """Check what a sequence says about itself, without producing a frame.
 
     Raises:
-        ExportError: No frames, frame numbers that do not ascend, or a frame rate that is not positive.
+        ExportError: No frames, frame numbers that do not ascend, a frame rate that is not positive, or a
+            binding of another number of frames.
     """
     frames = sequence.frame_numbers
     if not frames:
@@ -50,6 +63,11 @@ def check_sequence(sequence: GaussianSequence) -> None:
     if any(later <= earlier for earlier, later in pairwise(frames)):
         raise ExportError(
             f"sequence: expected ascending frame numbers, found {list(frames)[:8]}...: sort them"
+        )
+    if sequence.binding is not None and len(sequence.binding.T_world_rest) != len(frames):
+        raise ExportError(
+            f"sequence: expected the binding of {len(frames)} frames, found that of "
+            f"{len(sequence.binding.T_world_rest)}: cut both alike"
         )
     if not sequence.fps > 0:
         raise ExportError(f"sequence: expected frames per second > 0, found {sequence.fps}")
@@ -60,7 +78,7 @@ def checked_frames(sequence: GaussianSequence) -> Iterator[tuple[int, Gaussians]
 
     Raises:
         ExportError: A frame has another number of Gaussians than the sequence says, another number of
-            harmonics than the first frame, or a value that is not finite.
+            harmonics than the first frame, or a value that is not finite or not what its field holds.
     """
     harmonics_count = None
     for frame, gaussians in sequence:
@@ -76,14 +94,36 @@ def checked_frames(sequence: GaussianSequence) -> Iterator[tuple[int, Gaussians]
         harmonics_count = found
         frame_values = gaussians.map(lambda values: values.detach().cpu().to(torch.float32).contiguous())
         _check_finite(frame, frame_values)
+        _check_ranges(frame, frame_values)
         yield frame, frame_values
 
 
 def _check_finite(frame: int, gaussians: Gaussians) -> None:
     for name, values in vars(gaussians).items():
+        # A sum is finite only where all its terms are; the other way round it may overflow.
+        if torch.isfinite(values.sum()):
+            continue
         broken = (~torch.isfinite(values)).sum().item()
         if broken:
             raise ExportError(
                 f"frame {frame}: expected finite {name}, found {broken} values that are not: the rollout "
                 "diverged; export the frames before it, or train longer"
+            )
+
+
+def _check_ranges(frame: int, gaussians: Gaussians) -> None:
+    """Check that the values are physical: no logits, no logarithms, no quaternions of another length."""
+    if not len(gaussians):
+        return
+    lengths, scales, opacities = gaussians.rotations.norm(dim=-1), gaussians.scales, gaussians.opacities
+    for what, values, low, high in (
+        ("opacities", opacities, 0.0, 1.0),
+        ("scales", scales, 0.0, float("inf")),
+        ("lengths of quaternions", lengths, 1 - _UNIT, 1 + _UNIT),
+    ):
+        least, most = float(values.min()), float(values.max())
+        if not low <= least <= most <= high:
+            raise ExportError(
+                f"frame {frame}: expected {what} from {low:g} to {high:g}, found {least:g} to {most:g}: pass "
+                "the physical values that `Gaussians` documents"
             )

@@ -58,6 +58,45 @@ def test_export_writes_usd_and_ply_of_the_same_frames(trained, tmp_path):
     assert sorted(path.name for path in (tmp_path / "ply").iterdir())[-1] == "avatar.1010.ply"
 
 
+def test_one_export_writes_every_format_and_says_what_it_cost(trained, tmp_path):
+    from pxr import Usd, UsdGeom, UsdSkel
+
+    flags = {"usd": "a.usda", "ply": "ply", "compressed-ply": "small", "spz": "spz", "glb": "a.glb"}
+    places = [part for flag, name in flags.items() for part in (f"--{flag}", tmp_path / name)]
+    options = ("--half", "--clips", "--sh-degree", "3", "--frames", "1002-1006x2", "--name", "anna")
+    command("export", trained, *places, *options, "--json", tmp_path / "j")
+    facts = json.loads((tmp_path / "j").read_text())
+    assert set(facts["written"]) == {"usd", "ply", "compressed_ply", "spz", "glb"}
+    assert all(cost["bytes"] > 1000 and cost["files"] > 1 for cost in facts["cost"].values())
+    for folder, suffix in (("ply", "ply"), ("small", "compressed.ply"), ("spz", "spz")):
+        names = sorted(path.name for path in (tmp_path / folder).iterdir())
+        assert names == [f"anna.{frame}.{suffix}" for frame in (1002, 1004, 1006)]
+    assert len(list((tmp_path / "a.clips").glob("*.usdc"))) == 3
+    stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
+    kinds = {prim.GetTypeName() for prim in stage.Traverse()}
+    assert {"PointInstancer", "ParticleField3DGaussianSplat", "Skeleton", "SkelAnimation", "Camera"} <= kinds
+    assert UsdGeom.Camera.Get(stage, "/anna/cameras/turntable")
+    assert UsdSkel.Animation.Get(stage, "/anna/body/skeleton/motion").GetRotationsAttr().GetTimeSamples() == [
+        1002,
+        1004,
+        1006,
+    ]
+    command("export", "--check", tmp_path / "a.usda", "--json", tmp_path / "check.json")
+    assert json.loads((tmp_path / "check.json").read_text())["faults"] == []
+
+
+def test_a_faulty_file_is_told_and_exits_with_2(tmp_path, capsys):
+    values = "point3f[] positions = [(0, 0, 0)]\nint[] protoIndices = [0, 0]"
+    (tmp_path / "a.usda").write_text(f'#usda 1.0\ndef PointInstancer "a" {{\n{values}\n}}\n')
+    with pytest.raises(SystemExit) as stop:
+        command("export", "--check", tmp_path / "a.usda")
+    assert stop.value.code == 2
+    lines = capsys.readouterr().out.splitlines()
+    assert any(line.startswith("WRONG /a: expected 2 positions, found 1") for line in lines)
+    assert "faults" in lines[-1]
+    assert "expected a file to check" in failure(capsys, "export", "--check", tmp_path / "none.usda")
+
+
 def test_render_writes_sequences_per_camera(trained, tmp_path):
     import OpenEXR
 

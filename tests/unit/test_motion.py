@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from dsar.body.files import load_body
-from dsar.body.model import FACE_JOINTS, JOINT_NAMES, Body
+from dsar.body.model import FACE_JOINTS, JOINT_NAMES
 from dsar.body.skinning import pose_vertices
 from dsar.data.motion import EMBEDDED_MOTIONS, read_motion, resample, write_motion
 from dsar.errors import MotionError
 from dsar.geometry.rotations import matrix_from_axis_angle
-from dsar.types import Motion, Pose
+from dsar.types import Body, Motion, Pose
 
 HANDS = slice(FACE_JOINTS.stop, None)
 

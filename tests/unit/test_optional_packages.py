@@ -6,7 +6,17 @@ import torch
 
 from dsar.errors import MissingDependencyError
 from dsar.types import Camera, Gaussians, GaussianSequence, RenderOutput
-from dsar_exporters import read_ply, write_exr, write_ply, write_usd
+from dsar_exporters import (
+    CompressedPlySequence,
+    GltfSnapshot,
+    SpzSequence,
+    export,
+    read_ply,
+    read_splats,
+    write_exr,
+    write_ply,
+    write_usd,
+)
 from dsar_render import write_mp4
 
 OPTIONAL = (
@@ -15,6 +25,7 @@ OPTIONAL = (
     "OpenImageIO",
     "plyfile",
     "gsply",
+    "fourdgs",
     "imageio_ffmpeg",
     "mitsuba",
     "flip_evaluator",
@@ -32,9 +43,17 @@ def _no_frames():
         ("plyfile", "ply", lambda folder, sequence: write_ply(sequence, folder, name="a")),
         ("plyfile", "ply", lambda folder, _: read_ply(folder / "a.ply")),
         ("pxr.UsdVol", "usd", lambda folder, sequence: write_usd(sequence, folder / "a.usda", name="a")),
+        ("gsply", "ply", lambda folder, sequence: export(sequence, [SpzSequence(folder / "s", "a")])),
+        (
+            "gsply",
+            "ply",
+            lambda folder, sequence: export(sequence, [CompressedPlySequence(folder / "s", "a")]),
+        ),
+        ("gsply", "ply", lambda folder, _: read_splats(folder / "a.spz")),
+        ("fourdgs", "ply", lambda folder, sequence: export(sequence, [GltfSnapshot(folder / "a.glb")])),
         ("imageio_ffmpeg", "video", lambda folder, _: write_mp4(_no_frames(), folder / "a.mp4", fps=24.0)),
     ],
-    ids=["write_ply", "read_ply", "write_usd", "write_mp4"],
+    ids=["write_ply", "read_ply", "write_usd", "spz", "compressed", "read_splats", "glb", "write_mp4"],
 )
 def test_a_missing_package_is_named_with_its_extra_before_any_work(
     monkeypatch, tmp_path, module, extra, call

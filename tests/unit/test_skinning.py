@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from dsar.body.files import EMBEDDED_BODY, load_body
-from dsar.body.model import FACE_JOINTS, JOINT_NAMES, Body
+from dsar.body.model import FACE_JOINTS, JOINT_NAMES
 from dsar.body.skinning import blend_transforms, forward_kinematics, pose_vertices, skin_points
-from dsar.types import Pose
+from dsar.types import Body, Pose
 
 
 @pytest.fixture(scope="module")

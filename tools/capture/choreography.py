@@ -17,9 +17,8 @@ import numpy as np
 from numpy import ndarray
 
 from capture.posing import Curve, Score, compose_motion
-from dsar.body.model import Body
 from dsar.data.motion import read_motion
-from dsar.types import Motion
+from dsar.types import Body, Motion
 
 FPS = 30.0
 MOCAP = {

@@ -11,9 +11,8 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from capture.cloth import Collider, Fabric, build_struts, simulate
-from dsar.body.model import Body
 from dsar.body.skinning import forward_kinematics, skin_points
-from dsar.types import Motion
+from dsar.types import Body, Motion
 
 COLUMNS, ROWS = 96, 30
 BAND_ROWS = 3

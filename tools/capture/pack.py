@@ -16,9 +16,8 @@ from PIL import Image
 
 from capture.choreography import OneToMany, Take
 from capture.garment import COLUMNS, ROWS, grid_faces
-from dsar.body.model import Body
 from dsar.data.motion import write_motion
-from dsar.types import Camera
+from dsar.types import Body, Camera
 
 QUALITY = 77
 """Of the lossy WebP colours; the mask in the alpha channel stays exact."""

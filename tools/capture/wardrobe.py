@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from capture.prints import CREAM, linear, noise, paint_shirt
-from dsar.body.model import Body
+from dsar.types import Body
 
 SKIN, BLUSH, LIPS = linear(222, 172, 146), linear(206, 132, 112), linear(176, 84, 84)
 HAIR, HAIR_LIGHT = linear(46, 30, 22), linear(96, 62, 40)

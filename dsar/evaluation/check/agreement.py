@@ -10,12 +10,12 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from dsar.body.model import FACE_JOINTS, JOINT_NAMES, Body
+from dsar.body.model import FACE_JOINTS, JOINT_NAMES
 from dsar.body.skinning import forward_kinematics, pose_vertices
 from dsar.data.multiview import MultiViewCapture
 from dsar.geometry.cameras import project
 from dsar.raster.mesh import rasterize_mesh
-from dsar.types import Camera, Motion
+from dsar.types import Body, Camera, Motion
 
 COARSE, FINE = 256, 1024
 """Pixels of height to which larger images are reduced, to look for coarse and for fine mistakes."""

@@ -3,26 +3,25 @@
 The layout is the one of Kerbl et al. 2023: one binary little-endian element `vertex`, float32 properties
 `x y z nx ny nz f_dc_* f_rest_* opacity scale_* rot_*`, with the logarithm of the standard deviation, the
 logit of the opacity, the quaternion wxyz, and f_rest channel-major (all red, then green, then blue).
-No other module knows logarithms and logits.
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
-import torch
 from jaxtyping import Float32
 
 from dsar.errors import ExportError
 from dsar.types import Gaussians, GaussianSequence
-from dsar_exporters.checks import check_sequence, checked_frames
-from dsar_exporters.drafts import replacing
+from dsar_exporters.delivery import export
 from dsar_exporters.optional import require
+from dsar_exporters.splats.encoding import Encoded, decode, encode, padded
+from dsar_exporters.splats.files import SplatSequence
 
-# A scale of zero or an opacity of one is infinite when encoded, which viewers show as giant splats.
-_MIN_SCALE = 1e-8
-_OPACITY_MARGIN = 1e-6
+_REST_COUNTS = (0, 9, 24, 45)
+"""Harmonics above the constant, three channels each, of degrees 0 to 3."""
 
 
 def write_ply(
@@ -45,21 +44,37 @@ def write_ply(
         ExportError: The name cannot be part of a file name, or the sequence is not fit for export.
         MissingDependencyError: plyfile is not installed.
     """
-    if not name or any(separator in name for separator in "/\\"):
-        raise ExportError(f"PLY name: expected a name without / or \\, found {name!r}: rename it")
-    if sh_degree is not None and sh_degree not in range(4):
-        raise ExportError(f"PLY sh_degree: expected 0, 1, 2 or 3, found {sh_degree}")
-    check_sequence(sequence)
-    plyfile = _require_plyfile()
-    paths = []
-    for frame, gaussians in checked_frames(sequence):
-        vertices = _encode_vertices(_padded(gaussians, sh_degree))
+    output = PlySequence(folder, name, sh_degree=sh_degree)
+    export(sequence, [output])
+    return [output.frame_path(frame) for frame in sequence.frame_numbers]
+
+
+@dataclass(frozen=True)
+class PlySequence(SplatSequence):
+    """One PLY a frame; see `write_ply`."""
+
+    sh_degree: int | None = None
+    """Pad the harmonics with zeros to this degree."""
+
+    suffix: ClassVar[str] = ".ply"
+
+    def check(self) -> None:
+        """Raise where the degree is none, or plyfile is not installed."""
+        if self.sh_degree is not None and self.sh_degree not in range(4):
+            raise ExportError(f"PLY sh_degree: expected 0, 1, 2 or 3, found {self.sh_degree}")
+        _require_plyfile()
+
+    def write_frame(self, draft: Path, gaussians: Gaussians, sequence: GaussianSequence, frame: int) -> None:
+        """Write one frame."""
+        plyfile = _require_plyfile()
+        vertices = _records(encode(padded(gaussians, self.sh_degree)))
         element = plyfile.PlyElement.describe(vertices, "vertex")
-        path = folder / f"{name}.{frame:04d}.ply"
-        with replacing(path) as draft:
-            plyfile.PlyData([element], byte_order="<", comments=_comments(sequence, frame)).write(draft)
-        paths.append(path)
-    return paths
+        plyfile.PlyData([element], byte_order="<", comments=_comments(sequence, frame)).write(draft)
+
+    def estimated_bytes(self, first: Gaussians, frames: int) -> int:
+        """Return how large the files will be; see `Output`."""
+        count = first.harmonics.shape[1] if self.sh_degree is None else (self.sh_degree + 1) ** 2
+        return frames * len(first) * 4 * len(_property_names(count))
 
 
 def read_ply(path: Path) -> Gaussians:
@@ -74,10 +89,12 @@ def read_ply(path: Path) -> Gaussians:
     plyfile = _require_plyfile()
     try:
         vertices = plyfile.PlyData.read(path, mmap=False)["vertex"].data
-    except (OSError, KeyError, plyfile.PlyParseError) as error:
+    except (OSError, KeyError, ValueError, plyfile.PlyParseError) as error:
         raise ExportError(f"{path}: expected a PLY with an element 'vertex', found {error}") from error
     names = vertices.dtype.names or ()
     rest_names = [f"f_rest_{i}" for i in range(sum(field.startswith("f_rest_") for field in names))]
+    if len(rest_names) not in _REST_COUNTS:
+        raise ExportError(f"{path}: expected 0, 9, 24 or 45 properties f_rest_*, found {len(rest_names)}")
     count = len(rest_names) // 3 + 1
     if missing := [field for field in _property_names(count) if field not in names and field[0] != "n"]:
         raise ExportError(f"{path}: expected a Gaussian splat PLY, found no properties {', '.join(missing)}")
@@ -85,18 +102,18 @@ def read_ply(path: Path) -> Gaussians:
     def columns(*fields: str) -> Float32[np.ndarray, "n c"]:
         return np.stack([vertices[field] for field in fields], -1).astype(np.float32)
 
-    dc = columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None]
-    harmonics = dc
+    harmonics = columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None]
     if rest_names:
         rest = columns(*rest_names).reshape(-1, 3, count - 1).transpose(0, 2, 1)
-        harmonics = np.concatenate([dc, rest], 1)
-    quaternions = torch.from_numpy(columns("rot_0", "rot_1", "rot_2", "rot_3"))
-    return Gaussians(
-        means=torch.from_numpy(columns("x", "y", "z")),
-        rotations=torch.nn.functional.normalize(quaternions, dim=-1),
-        scales=torch.from_numpy(columns("scale_0", "scale_1", "scale_2")).exp(),
-        opacities=torch.from_numpy(columns("opacity")[:, 0]).sigmoid(),
-        harmonics=torch.from_numpy(np.ascontiguousarray(harmonics)),
+        harmonics = np.ascontiguousarray(np.concatenate([harmonics, rest], 1))
+    return decode(
+        Encoded(
+            means=columns("x", "y", "z"),
+            log_scales=columns("scale_0", "scale_1", "scale_2"),
+            rotations=columns("rot_0", "rot_1", "rot_2", "rot_3"),
+            logits=columns("opacity")[:, 0],
+            harmonics=harmonics,
+        )
     )
 
 
@@ -112,34 +129,20 @@ def _property_names(harmonics_count: int) -> list[str]:
     return [*names, "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
 
 
-def _padded(gaussians: Gaussians, sh_degree: int | None) -> Gaussians:
-    """Return the Gaussians with harmonics extended by zeros, never cut, to a degree."""
-    missing = 0 if sh_degree is None else (sh_degree + 1) ** 2 - gaussians.harmonics.shape[1]
-    if missing < 0:
-        raise ExportError(
-            f"PLY sh_degree: expected at least the degree of the sequence, found {sh_degree} for "
-            f"{gaussians.harmonics.shape[1]} harmonics: cutting them would change the colours"
-        )
-    harmonics = torch.nn.functional.pad(gaussians.harmonics, (0, 0, 0, missing))
-    return Gaussians(gaussians.means, gaussians.rotations, gaussians.scales, gaussians.opacities, harmonics)
-
-
-def _encode_vertices(gaussians: Gaussians) -> np.ndarray:
-    """Return the records of the element `vertex`, log-scales and logits included."""
-    count = gaussians.harmonics.shape[1]
-    opacity = gaussians.opacities.clamp(_OPACITY_MARGIN, 1 - _OPACITY_MARGIN)
+def _records(encoded: Encoded) -> np.ndarray:
+    """Return the records of the element `vertex`."""
+    rows, count = encoded.harmonics.shape[:2]
     columns = [
-        gaussians.means,
-        torch.zeros_like(gaussians.means),
-        gaussians.harmonics[:, 0],
-        gaussians.harmonics[:, 1:].transpose(1, 2).reshape(len(gaussians), 3 * (count - 1)),
-        opacity.logit()[:, None],
-        gaussians.scales.clamp_min(_MIN_SCALE).log(),
-        gaussians.rotations,
+        encoded.means,
+        np.zeros_like(encoded.means),
+        encoded.harmonics[:, 0],
+        encoded.harmonics[:, 1:].transpose(0, 2, 1).reshape(rows, 3 * (count - 1)),
+        encoded.logits[:, None],
+        encoded.log_scales,
+        encoded.rotations,
     ]
-    rows = torch.cat(columns, 1).numpy().astype("<f4", copy=False)
     dtype = np.dtype([(field, "<f4") for field in _property_names(count)])
-    return rows.reshape(-1).view(dtype)
+    return np.concatenate(columns, 1).astype("<f4", copy=False).reshape(-1).view(dtype)
 
 
 def _comments(sequence: GaussianSequence, frame: int) -> list[str]:
