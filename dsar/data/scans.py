@@ -111,9 +111,17 @@ class Scans:
         return torch.from_numpy(np.ascontiguousarray(image[..., :3])).float() / 255
 
 
-@lru_cache(maxsize=4)
 def _load(path: Path) -> Any:
-    """Return what a pickle holds; kept for the next camera of the same frame."""
+    """Return what a pickle holds; kept for the next camera of the same frame, while the file is the same."""
+    try:
+        state = path.stat()
+    except OSError as error:
+        raise CaptureError(f"{path}: cannot be read ({error}); download it again") from error
+    return _load_once(path, state.st_mtime_ns, state.st_size)
+
+
+@lru_cache(maxsize=4)
+def _load_once(path: Path, _time: int, _size: int) -> Any:
     try:
         return read_pickle(path)
     except PICKLE_ERRORS as error:

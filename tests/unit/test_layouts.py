@@ -12,6 +12,7 @@ import torch
 from dsar.body.files import EMBEDDED_BODY, load_body
 from dsar.body.skinning import pose_vertices
 from dsar.data.capture import open_capture
+from dsar.data.scans import _load
 from dsar.errors import BodyError, CaptureError, DsarError, MotionError
 from dsar.geometry.cameras import project
 
@@ -374,3 +375,10 @@ def test_a_folder_of_no_known_format_is_refused_with_the_formats(tmp_path):
         CaptureError, match=r"no format that we know: our own .*AvatarReX.*THuman4.*ActorsHQ.*4D-DRESS"
     ):
         open_capture(tmp_path)
+
+
+def test_a_scan_that_was_replaced_is_read_anew(tmp_path):
+    path = tmp_path / "mesh.pkl"
+    for content in ({"faces": 1}, {"faces": 2}):
+        path.write_bytes(pickle.dumps(content))
+        assert _load(path) == content
