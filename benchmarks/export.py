@@ -32,6 +32,7 @@ from dsar.types import Binding, Gaussians, GaussianSequence
 from dsar_exporters import UsdAsset, export
 
 FPS = 24.0
+_ROUNDS = 5
 
 
 def make_sequence(count: int, frames: int) -> GaussianSequence:
@@ -259,8 +260,16 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         found["gaussians"], found["frames"] = size
-        found["ours"] = write_ours(make_sequence(*size), folder)
-        found["usd_core"] = write_bound(folder / "ours.payload.usdc", folder)
+        # In turn, so that both meet the same machine and disk.
+        rounds = []
+        for _ in range(_ROUNDS):
+            ours = write_ours(make_sequence(*size), folder)
+            rounds.append((ours, write_bound(folder / "ours.payload.usdc", folder)))
+            (folder / "bound.usdc").unlink()
+        found["ours"], found["usd_core"] = (
+            sorted(each, key=lambda one: one["seconds"])[_ROUNDS // 2] for each in zip(*rounds, strict=True)
+        )
+        found["ratios_by_round"] = [ours["seconds"] / bound["seconds"] for ours, bound in rounds]
         found["ours_half"] = write_ours(make_sequence(*size), folder, half=True)
     writers: dict[str, Callable] = {"ours": write_ours, "naive": write_naive, "fourdgs": write_fourdgs}
     found["rivals"] = {"gaussians": small[0], "frames": small[1]}
@@ -272,9 +281,9 @@ def main() -> None:
     print(json.dumps({key: value for key, value in found.items() if key != "machine"}, indent=1))
     if options.json:
         write_json(found, options.json)
-    ours, bound, rivals = found["ours"], found["usd_core"], found["rivals"]
+    ours, rivals, ratios = found["ours"], found["rivals"], sorted(found["ratios_by_round"])
     print(f"payload over distinct attribute bytes: {ours['payload_over_distinct_attribute_bytes']:.2f}")
-    print(f"our time over usd-core's alone: {ours['seconds'] / bound['seconds']:.2f}")
+    print(f"our time over usd-core's alone: {ratios[_ROUNDS // 2]:.2f} ({ratios[0]:.2f} to {ratios[-1]:.2f})")
     for rival in ("naive", "fourdgs"):
         ratio = rivals[rival]["seconds"] / rivals["ours"]["seconds"]
         print(f"{rival}'s time over ours: {ratio:.2f}")
