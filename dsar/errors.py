@@ -7,6 +7,7 @@ DsarError                       every message says what, where, expected, found,
 ├── BodyError        (ValueError)   a body-model file
 ├── CheckpointError  (ValueError)   a run folder or its checkpoint
 ├── ExportError      (ValueError)   something that cannot be written as asked
+├── RenderError      (RuntimeError) frames could not be rendered
 ├── TrainingError    (ArithmeticError) training stopped: a value is not finite
 └── MissingDependencyError (ImportError) an optional package is not installed
 """
@@ -42,6 +43,10 @@ class ExportError(DsarError, ValueError):
 
 class RasterError(DsarError, ValueError):
     """Gaussians cannot be drawn."""
+
+
+class RenderError(DsarError, RuntimeError):
+    """Frames could not be rendered: workers or a cluster failed."""
 
 
 class TrainingError(DsarError, ArithmeticError):

@@ -184,8 +184,70 @@ class RenderOutput:
     median_depth: Float[Tensor, "h w"] | None = None
     """On request: z of the Gaussian with which transmittance falls to a half, else of the last one, metres; 0
     where nothing was hit. No gradient."""
+    front_depth: Float[Tensor, "h w"] | None = None
+    """On request: z of the foremost Gaussian, metres; 0 where nothing was hit. No gradient."""
+    heaviest: Int[Tensor, "h w"] | None = None
+    """On request: index of the Gaussian with the largest share, the foremost of equals; -1 where nothing was
+    hit."""
     contributors: Contributors | None = None
     """On request; no gradient."""
+
+
+@dataclass(frozen=True)
+class Aovs:
+    """What a compositor wants to know of each pixel besides its colour; None or empty where not asked for."""
+
+    normals: Float[Tensor, "h w 3"] | None = None
+    """Unit, world, towards the camera: the Gaussians' thinnest axes, blended; 0 where nothing was hit."""
+    positions: Float[Tensor, "h w 3"] | None = None
+    """World point, metres, at the pixel's centre and expected depth; 0 where nothing was hit."""
+    forward: Float[Tensor, "h w 2"] | None = None
+    """Pixels, x right and y down, that what is seen moves until the next frame; 0 where nothing was hit, and
+    at a motion's last frame."""
+    backward: Float[Tensor, "h w 2"] | None = None
+    """Pixels, x right and y down, from where what is seen is to where it was a frame before, likewise."""
+    coverage: Mapping[str, Float[Tensor, "h w"]] = field(default_factory=dict)
+    """By label, such as `left_arm` or `garment`: its share of the pixel's alpha; they sum to it."""
+
+
+@dataclass(frozen=True)
+class DeepSamples:
+    """The Gaussians of every pixel as samples at a depth, pixel after pixel, row by row, front to back."""
+
+    counts: Int[Tensor, "h w"]
+    """How many samples each pixel has."""
+    colors: Float[Tensor, "m 3"]
+    """Display-referred sRGB, not premultiplied."""
+    alphas: Float[Tensor, " m"]
+    """Of the sample alone, whatever lies in front of it."""
+    depths: Float[Tensor, " m"]
+    """Camera-space z, metres; never decreases within a pixel."""
+    ids: Int[Tensor, " m"]
+    """Index of the Gaussian, of the heaviest where several became one sample."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One camera's image of one frame, with all that a file of it says."""
+
+    frame: int
+    """Frame number."""
+    camera: Camera
+    """The view that is delivered; the image may reach beyond it (`overscan`)."""
+    output: RenderOutput
+    """Without a background. Colours and alpha over the shutter's time, the rest at the frame itself."""
+    aovs: Aovs = field(default_factory=Aovs)
+    """At the frame itself, coverage over the shutter's time."""
+    deep: DeepSamples | None = None
+    """On request."""
+    overscan: int = 0
+    """Pixels by which the image is larger than the camera's on each of its four sides."""
+    shutter: tuple[float, float] = (0.0, 0.0)
+    """When the shutter opens and closes, in frames from the frame's own time."""
+    fps: float = 24.0
+    """Frames per second of the frame numbers."""
+    provenance: Mapping[str, str] = field(default_factory=dict)
+    """Where the image comes from; written into every file."""
 
 
 @dataclass(frozen=True)

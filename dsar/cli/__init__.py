@@ -12,11 +12,12 @@ from typing import Annotated
 import tyro
 
 from dsar.cli.check import Check
-from dsar.cli.deliver import Export, Render
+from dsar.cli.export import Export
 from dsar.cli.measure import Eval, Stress
+from dsar.cli.render import Render
 from dsar.cli.train import Train
 from dsar.config import PRESETS
-from dsar.errors import DsarError
+from dsar.errors import DsarError, RenderError
 
 
 def parse(arguments: Sequence[str]) -> Train | Check | Export | Render | Eval | Stress:
@@ -64,7 +65,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             command.run()
     except DsarError as error:
         sys.stderr.write(f"dsar: {error}\n")
-        raise SystemExit(2) from error
+        # What was done of a batch is there; what was asked for was right.
+        raise SystemExit(1 if isinstance(error, RenderError) else 2) from error
     except KeyboardInterrupt:
         sys.stderr.write("dsar: interrupted; what was done is saved (continue with --resume)\n")
         raise SystemExit(130) from None

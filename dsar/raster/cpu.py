@@ -69,9 +69,9 @@ class _Settings:
 def _apply(gaussians: Gaussians, background: Tensor | None, settings: _Settings) -> RenderOutput:
     fields = (getattr(gaussians, field.name) for field in dataclasses.fields(gaussians))
     images = _Rasterize.apply(*fields, background, settings)
-    color, alpha, depth, culled, median, counts, ids, weights = images  # type: ignore[misc]  # untyped
-    contributors = Contributors(counts, ids, weights) if counts is not None else None
-    return RenderOutput(color, alpha, depth, culled, median, contributors)
+    color, alpha, depth, culled, median, front, heaviest, *found = images  # type: ignore[misc]  # untyped
+    contributors = Contributors(*found) if found[0] is not None else None
+    return RenderOutput(color, alpha, depth, culled, median, front, heaviest, contributors)
 
 
 class _Rasterize(torch.autograd.Function):
@@ -167,27 +167,32 @@ def _bin(
 def _survey(
     records: np.ndarray, tile_starts: np.ndarray, pairs: np.ndarray, tiles_x: int, settings: _Settings
 ) -> tuple[Tensor | None, ...]:
-    """Return median depths, and the counts, ids and weights of contributors; None for what is not wanted."""
+    """Return median and front depths, the heaviest splats, and the counts, ids and weights of contributors.
+
+    What is not wanted is None.
+    """
     if not settings.outputs:
-        return None, None, None, None
+        return (None,) * 6
     width, height = settings.camera.width, settings.camera.height
-    medians, counts = torch.empty(height, width), torch.empty(height, width, dtype=torch.int64)
+    medians, fronts = torch.empty(height, width), torch.empty(height, width)
+    heaviest, counts = (torch.empty(height, width, dtype=torch.int64) for _ in range(2))
     ids, weights = torch.empty(0, dtype=torch.int64), torch.empty(0)
     starts = np.zeros(height * width, np.int64)
 
     def survey() -> None:
-        run_parts(survey_part, records, tile_starts, pairs, tiles_x, starts, medians.numpy(), counts.numpy(),
-                  ids.numpy(), weights.numpy())  # fmt: skip
+        run_parts(survey_part, records, tile_starts, pairs, tiles_x, starts, medians.numpy(), fronts.numpy(),
+                  heaviest.numpy(), counts.numpy(), ids.numpy(), weights.numpy())  # fmt: skip
 
     survey()
-    wanted = medians if "median_depth" in settings.outputs else None
+    images = {"median_depth": medians, "front_depth": fronts, "heaviest": heaviest}
+    wanted = tuple(image if name in settings.outputs else None for name, image in images.items())
     if "contributors" not in settings.outputs:
-        return wanted, None, None, None
+        return *wanted, None, None, None
     ends = counts.flatten().cumsum(0)
     starts = (ends - counts.flatten()).numpy()
     ids, weights = torch.empty(int(ends[-1]), dtype=torch.int64), torch.empty(int(ends[-1]))
     survey()
-    return wanted, counts, ids, weights
+    return *wanted, counts, ids, weights
 
 
 def _prepare_part(

@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from dsar.errors import ConfigError, MissingDependencyError
+from dsar.raster.contributors import find_front_depth, find_heaviest
 from dsar.raster.conventions import ALPHA_MAX, NEAR
 from dsar.raster.reference import rasterize_reference
 from dsar.types import Camera, Contributors, Gaussians, RenderOutput
@@ -59,19 +60,18 @@ def rasterize_cuda(
     if background is not None:
         color = color + (1 - alpha[..., None]) * background
     drawn = (meta["radii"][0] > 0).all(-1).sum()
-    median = contributors = None
+    extras: dict[str, Any] = {}
     if outputs:
         contributors, before = _find_contributors(gsplat, meta, camera)
-        if "median_depth" in outputs:
-            median = _median_depth(contributors, before, meta["depths"][0].detach())
-    return RenderOutput(
-        color,
-        alpha,
-        depth,
-        len(gaussians) - drawn,
-        median,
-        contributors if "contributors" in outputs else None,
-    )
+        depths = meta["depths"][0].detach()
+        found = {
+            "median_depth": lambda: _median_depth(contributors, before, depths),
+            "front_depth": lambda: find_front_depth(contributors, depths),
+            "heaviest": lambda: find_heaviest(contributors),
+            "contributors": lambda: contributors,
+        }
+        extras = {name: found[name]() for name in outputs}
+    return RenderOutput(color, alpha, depth, len(gaussians) - drawn, **extras)
 
 
 @cache

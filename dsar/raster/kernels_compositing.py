@@ -52,9 +52,10 @@ _V_RED, _V_GREEN, _V_BLUE, _V_DEPTH, _LEVEL, _REST = (
     np.uint64(plane * LANES) for plane in (3, 4, 5, 6, 7, 8)
 )
 _BACKWARD = np.uint64(9 * LANES)
-# Survey: depth at half transmittance, and how many splats were blended.
-_MEDIAN, _COUNT = (np.uint64(plane * LANES) for plane in (3, 4))
-_SURVEY = np.uint64(5 * LANES)
+# Survey: depth at half transmittance, how many splats were blended, depth of the first, and the largest
+# weight with its splat (a number that is exact up to 16 million).
+_MEDIAN, _COUNT, _FRONT, _LARGEST, _HEAVIEST = (np.uint64(plane * LANES) for plane in (3, 4, 5, 6, 7))
+_SURVEY = np.uint64(8 * LANES)
 
 _LOG_ALPHA_MIN, _LOG_ALPHA_MAX = np.float32(math.log2(ALPHA_MIN)), np.float32(math.log2(ALPHA_MAX))
 _ALPHA_MAX, _T_MIN = np.float32(ALPHA_MAX), np.float32(TRANSMITTANCE_MIN)
@@ -302,34 +303,56 @@ def composite_backward_part(
                 _blend_splat_backward(state, blocks, records, i, left, top, pair_sums[place])
 
 
+@inlined
+def _note(state, start, i, z, weight, before):
+    """Remember of a splat what is asked about a block's pixels."""
+    blended = weight > _ZERO
+    z = spread(z)
+    median, front = load(state, start + _MEDIAN), load(state, start + _FRONT)
+    count = load(state, start + _COUNT)
+    store(state, start + _MEDIAN, choose(blended & (before > _HALF), z, median))
+    store(state, start + _FRONT, choose(blended & (count < _HALF), z, front))
+    store(state, start + _COUNT, count + choose(blended, spread(_ONE), spread(_ZERO)))
+    largest, heaviest = load(state, start + _LARGEST), load(state, start + _HEAVIEST)
+    heavier = weight > largest
+    store(state, start + _LARGEST, choose(heavier, weight, largest))
+    store(state, start + _HEAVIEST, choose(heavier, spread(np.float32(i)), heaviest))
+
+
 @kernel
 def survey_part(
-    part, parts, records, tile_starts, pairs, tiles_x, starts, medians, counts, ids, weights
+    part, parts, records, tile_starts, pairs, tiles_x, starts,
+    medians, fronts, heaviest, counts, ids, weights,
 ):  # fmt: skip
-    """Blend every parts-th tile once more, for its median depths and how many splats each pixel has.
+    """Blend every parts-th tile once more, for depths, the heaviest splat and how many each pixel has.
 
     If `ids` is not empty, write each pixel's splats and weights from its start on. One kernel does both,
     because another might round otherwise, and find another number of splats.
     """
     height, width = medians.shape
-    state, lanes, cursors = (
-        _new_state(_SURVEY),
-        np.empty(LANES, np.float32),
-        np.zeros(BLOCKS * LANES, np.int64),
-    )
+    state, flat = _new_state(_SURVEY), records.reshape(-1)
+    lanes, cursors = np.empty(LANES, np.float32), np.zeros(BLOCKS * LANES, np.int64)
     collecting = len(ids) > 0
     for tile in range(part, len(tile_starts) - 1, parts):
         left, top = tile % tiles_x * TILE, tile // tiles_x * TILE
         _open_tile(state, _SURVEY, width - left, height - top)
         for block in range(np.uint64(BLOCKS)):
-            store(state, block * _SURVEY + _MEDIAN, spread(_ZERO))
-            store(state, block * _SURVEY + _COUNT, spread(_ZERO))
+            for plane in (_MEDIAN, _COUNT, _FRONT, _LARGEST):
+                store(state, block * _SURVEY + plane, spread(_ZERO))
+            store(state, block * _SURVEY + _HEAVIEST, spread(-_ONE))
         if collecting:
             for y in range(min(TILE, height - top)):
                 for x in range(min(TILE, width - left)):
                     cursors[_pixel(x, y, np.uint64(LANES))] = starts[(top + y) * width + left + x]
-        for place in range(tile_starts[tile], tile_starts[tile + 1]):
-            blocks, i = np.uint32(pairs[place, 1]), np.uint64(pairs[place, 0])
+        live = _find_live(state, _SURVEY)
+        first, end = np.uint64(tile_starts[tile]), np.uint64(tile_starts[tile + 1])
+        for place in range(first, end):
+            if (place - first) % np.uint64(_PATIENCE) == np.uint64(_PATIENCE - 1):
+                live = _find_live(state, _SURVEY)
+                if live == np.uint32(0):
+                    break
+            _fetch_ahead(flat, pairs, place)
+            blocks, i = np.uint32(pairs[place, 1]) & live, np.uint64(pairs[place, 0])
             splat = _at_corner(records, i, left, top)
             while blocks != np.uint32(0):
                 block = lowest_bit(blocks)
@@ -337,10 +360,7 @@ def survey_part(
                 blocks &= blocks - np.uint32(1)
                 _, _, _, weight, before = _blend(state, start, *splat)
                 blended = weight > _ZERO
-                median = load(state, start + _MEDIAN)
-                store(state, start + _MEDIAN,
-                      choose(blended & (before > _HALF), spread(records[i, 9]), median))  # fmt: skip
-                _add(state, start + _COUNT, choose(blended, spread(_ONE), spread(_ZERO)))
+                _note(state, start, i, records[i, 9], weight, before)
                 store(lanes, np.uint64(0), weight)
                 hits = bits_of(blended) if collecting else np.uint32(0)
                 while hits != np.uint32(0):
@@ -353,4 +373,6 @@ def survey_part(
             for x in range(min(TILE, width - left)):
                 pixel = _pixel(x, y, _SURVEY)
                 medians[top + y, left + x] = state[pixel + _MEDIAN]
+                fronts[top + y, left + x] = state[pixel + _FRONT]
+                heaviest[top + y, left + x] = np.int64(state[pixel + _HEAVIEST])
                 counts[top + y, left + x] = np.int64(state[pixel + _COUNT])

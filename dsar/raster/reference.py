@@ -5,6 +5,7 @@ It is what the fast kernels are tested against, so it follows the formulas and n
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -12,6 +13,7 @@ from torch import Tensor
 
 from dsar.geometry.harmonics import color_from_harmonics
 from dsar.geometry.rotations import matrix_from_quaternion
+from dsar.raster.contributors import find_front_depth, find_heaviest
 from dsar.raster.conventions import (
     ALPHA_MAX,
     ALPHA_MIN,
@@ -73,13 +75,20 @@ def rasterize_reference(
     depth = torch.where(hit, depth / torch.where(hit, alpha, 1), 0)
     if background is not None:
         color = color + (1 - alpha) * background
-    median = contributors = None
-    if "median_depth" in outputs:
-        median = torch.cat([torch.cat([tile.median_depth for tile in row], 1) for row in rows], 0)
-    if "contributors" in outputs:
-        contributors = _join([tile for row in rows for tile in row], camera)
     culled = torch.tensor(len(gaussians) - len(splats.ids), device=color.device)
-    return RenderOutput(color, alpha[..., 0], depth[..., 0], culled, median, contributors)
+    extras: dict[str, Any] = {}
+    if "median_depth" in outputs:
+        extras["median_depth"] = torch.cat([torch.cat([t.median_depth for t in row], 1) for row in rows], 0)
+    if {"front_depth", "heaviest", "contributors"} & set(outputs):
+        contributors = _join([tile for row in rows for tile in row], camera)
+        depths = splats.features.new_zeros(len(gaussians)).index_copy(0, splats.ids, splats.features[:, 3])
+        found = {
+            "front_depth": lambda: find_front_depth(contributors, depths.detach()),
+            "heaviest": lambda: find_heaviest(contributors),
+            "contributors": lambda: contributors,
+        }
+        extras |= {name: found[name]() for name in outputs if name in found}
+    return RenderOutput(color, alpha[..., 0], depth[..., 0], culled, **extras)
 
 
 def _splat(gaussians: Gaussians, camera: Camera, dilation: float, antialiased: bool) -> _Splats:

@@ -6,7 +6,7 @@ mix of formats from one rollout.
 """
 
 from dsar_exporters.delivery import Delivered, Output, export
-from dsar_exporters.exr import exr_path, write_exr
+from dsar_exporters.exr import ColorTarget, ExrSequence, exr_path, ocio_config, write_exr
 from dsar_exporters.frames import parse_frames
 from dsar_exporters.inspection import find_faults
 from dsar_exporters.splats import (
@@ -18,11 +18,13 @@ from dsar_exporters.splats import (
     read_splats,
     write_ply,
 )
-from dsar_exporters.usd import UsdAsset, write_usd
+from dsar_exporters.usd import UsdAsset, read_usd_cameras, write_usd
 
 __all__ = [
+    "ColorTarget",
     "CompressedPlySequence",
     "Delivered",
+    "ExrSequence",
     "GltfSnapshot",
     "Output",
     "PlySequence",
@@ -31,9 +33,11 @@ __all__ = [
     "export",
     "exr_path",
     "find_faults",
+    "ocio_config",
     "parse_frames",
     "read_ply",
     "read_splats",
+    "read_usd_cameras",
     "write_exr",
     "write_ply",
     "write_usd",

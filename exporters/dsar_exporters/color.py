@@ -4,80 +4,134 @@ The conversion happens once, after blending, on colours freed of their alpha; co
 premultiplied value instead would darken every soft edge.
 """
 
+import os
+from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32
 
+from dsar.color import linear_from_srgb
 from dsar.errors import ExportError
 from dsar_exporters.optional import require
 
 LINEAR_REC709 = "lin_rec709_scene"
-_CONFIG = "ocio://default"
+_BUILT_IN = "ocio://default"
+_SOURCES = ("srgb_rec709_scene", "srgb_tx", "sRGB - Texture", "Utility - sRGB - Texture")
+"""Names that configurations have for what the avatars' colours are: sRGB's curve on Rec.709's primaries,
+without a display's view transform."""
 # Below this coverage a colour has no digits left; its contribution to the image is invisible.
 _MIN_ALPHA = 1e-6
 
 
-def linear_from_srgb(color: Float32[np.ndarray, "*b"]) -> Float32[np.ndarray, "*b"]:
-    """Decode sRGB (IEC 61966-2-1) to linear light; values above 1 follow the same curve, below 0 become 0."""
-    color = np.maximum(color, np.float32(0))
-    curve = ((color + np.float32(0.055)) / np.float32(1.055)) ** np.float32(2.4)
-    return np.where(color <= 0.04045, color / np.float32(12.92), curve)
-
-
-def linear_premultiplied(
-    color: Float32[np.ndarray, "h w 3"], alpha: Float32[np.ndarray, "h w"], colorspace: str
-) -> Float32[np.ndarray, "h w 3"]:
-    """Return display-referred sRGB, premultiplied, as premultiplied values of another colour space.
-
-    Args:
-        color: Blended sRGB, premultiplied by alpha, without a background.
-        alpha: Coverage in [0, 1].
-        colorspace: `lin_rec709_scene`, or any name, alias or role of the built-in OCIO configuration.
+@dataclass(frozen=True)
+class ColorTarget:
+    """A colour space to write, and the configuration that knows it.
 
     Raises:
-        ExportError: OCIO does not know the colour space.
+        ExportError: The configuration cannot be read, or does not know the colour space, or not the sRGB that
+            the avatar's colours are in.
         MissingDependencyError: A space other than lin_rec709_scene, and OpenImageIO is not installed.
     """
-    coverage = alpha[..., None]
-    straight = np.divide(color, coverage, out=np.zeros_like(color), where=coverage > _MIN_ALPHA)
-    linear = linear_from_srgb(straight)
-    if colorspace != LINEAR_REC709:
-        linear = _convert_linear(linear, colorspace)
-    return linear * coverage
+
+    colorspace: str = LINEAR_REC709
+    """`lin_rec709_scene`, or any name, alias or role of the configuration."""
+    config: str = _BUILT_IN
+    """An OCIO configuration's file, or the name of a built-in one."""
+
+    def __post_init__(self) -> None:
+        """Look the colour space up, so that a wrong name is found before any work."""
+        _ = self.interop_id
+
+    @property
+    def interop_id(self) -> str:
+        """The Color Interop Forum's id of the colour space, `unknown` where it has none."""
+        return _interop_id(self.colorspace, self.config)
+
+    def from_display(self, straight: Float32[np.ndarray, "*n 3"]) -> Float32[np.ndarray, "*n 3"]:
+        """Return display-referred sRGB, not premultiplied, in this colour space."""
+        linear = linear_from_srgb(straight)
+        # Without a configuration of the user's, Rec.709 needs none.
+        if (self.colorspace, self.config) == (LINEAR_REC709, _BUILT_IN):
+            return linear
+        return _converted(straight, self.colorspace, self.config)
+
+    def premultiplied(
+        self, color: Float32[np.ndarray, "h w 3"], alpha: Float32[np.ndarray, "h w"]
+    ) -> Float32[np.ndarray, "h w 3"]:
+        """Return blended, premultiplied sRGB as premultiplied values of this colour space.
+
+        Args:
+            color: Blended sRGB, premultiplied by alpha, without a background.
+            alpha: Coverage in [0, 1].
+        """
+        result = np.zeros_like(color)
+        # Most of a picture is empty.
+        hit = alpha > _MIN_ALPHA
+        coverage = alpha[hit, None]
+        result[hit] = self.from_display(color[hit] / coverage) * coverage
+        return result
+
+
+def ocio_config(path: Path | None) -> str:
+    """Return the configuration to use: the one named, else $OCIO's, else the built-in default."""
+    return str(path) if path is not None else os.environ.get("OCIO") or _BUILT_IN
 
 
 @lru_cache
-def interop_id(colorspace: str) -> str:
-    """Return the Color Interop Forum's id of a colour space, `unknown` where it has none.
-
-    Raises:
-        ExportError: OCIO does not know the colour space.
-        MissingDependencyError: A space other than lin_rec709_scene, and OpenImageIO is not installed.
-    """
-    if colorspace == LINEAR_REC709:
+def _interop_id(colorspace: str, config: str) -> str:
+    if (colorspace, config) == (LINEAR_REC709, _BUILT_IN):
         return colorspace
-    config = _require_oiio().ColorConfig(_CONFIG)
-    name = config.resolve(colorspace)
-    if name not in config.getColorSpaceNames():
+    found = _open(config)
+    if found.resolve(colorspace) not in found.getColorSpaceNames():
         raise ExportError(
-            f"colour space: expected a name or alias known to OCIO ({_CONFIG}), such as {LINEAR_REC709} or "
-            f"ACEScg, found {colorspace!r}"
+            f"colour space: expected a name, alias or role known to OCIO ({config}), such as {LINEAR_REC709} "
+            f"or ACEScg, found {colorspace!r}"
         )
-    return config.get_color_interop_id(name) or "unknown"
+    _source(config)
+    return found.get_color_interop_id(found.resolve(colorspace)) or "unknown"
 
 
-def _convert_linear(linear: Float32[np.ndarray, "h w 3"], colorspace: str) -> Float32[np.ndarray, "h w 3"]:
-    """Return linear Rec.709 pixels in another colour space of the built-in OCIO configuration."""
-    interop_id(colorspace)  # names the colour space in its error, which the conversion's own would not
+@lru_cache
+def _source(config: str) -> str:
+    """Return the configuration's name for the colours of avatars."""
+    found = _open(config)
+    names = found.getColorSpaceNames()
+    source = next((name for name in _SOURCES if found.resolve(name) in names), None)
+    if source is None:
+        raise ExportError(
+            f"--ocio {config}: expected a colour space for sRGB textures, found none of "
+            f"{', '.join(_SOURCES)}: make one of them an alias in the configuration"
+        )
+    return source
+
+
+def _open(config: str):
+    """Return a configuration; not kept, because OpenImageIO complains of any that is left at the end."""
+    if not config.startswith("ocio://") and not Path(config).is_file():
+        raise ExportError(f"--ocio {config}: expected an OCIO configuration, found no such file")
+    found = _require_oiio().ColorConfig(config)
+    if found.geterror() or not found.getColorSpaceNames():
+        raise ExportError(f"--ocio {config}: expected an OCIO configuration, found one that cannot be read")
+    return found
+
+
+def _converted(
+    straight: Float32[np.ndarray, "*n 3"], colorspace: str, config: str
+) -> Float32[np.ndarray, "*n 3"]:
+    """Return display-referred colours in another colour space of a configuration; below 0 becomes 0."""
+    if not straight.size:
+        return straight
     oiio = _require_oiio()
-    image = oiio.ImageBuf(np.ascontiguousarray(linear))
+    pixels = np.ascontiguousarray(np.maximum(straight, 0).reshape(1, -1, 3))
+    image = oiio.ImageBuf(pixels)
     converted = oiio.ImageBufAlgo.colorconvert(
-        image, LINEAR_REC709, colorspace, unpremult=False, colorconfig=_CONFIG
+        image, _source(config), colorspace, unpremult=False, colorconfig=config
     )
     if converted.has_error:
         raise ExportError(f"colour space {colorspace!r}: {converted.geterror()}")
-    return converted.get_pixels(oiio.FLOAT)
+    return converted.get_pixels(oiio.FLOAT).reshape(straight.shape)
 
 
 def _require_oiio():

@@ -8,8 +8,8 @@ from typing import Any
 
 from fileseq.frameset import FrameSet
 
+from dsar.drafts import replacing
 from dsar.types import GaussianSequence
-from dsar_exporters.drafts import replacing
 
 _PACKAGES = ("dsar-avatar", "torch", "usd-core", "plyfile", "gsply", "fourdgs")
 

@@ -1,16 +1,24 @@
 """Eight-bit images for people to look at; a compositor gets EXR instead."""
 
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
+from PIL.PngImagePlugin import PngInfo
+from torch import Tensor
 
-from dsar.types import RenderOutput
-from dsar_render.drafts import replacing
+from dsar.drafts import replacing
+from dsar.types import Camera, Picture, RenderOutput
 
 # Below this coverage an 8-bit alpha is zero and a straight colour is noise.
 _MIN_ALPHA = 0.5 / 255
+_JOB = "dsar/job"
+"""Text chunk of a PNG that names the job it comes from."""
+_LAST_CHUNK = b"IEND\xaeB`\x82"
 
 
 def display_image(output: RenderOutput) -> UInt8[np.ndarray, "h w 3"]:
@@ -18,19 +26,85 @@ def display_image(output: RenderOutput) -> UInt8[np.ndarray, "h w 3"]:
     return _quantized(output.color.detach().cpu().numpy())
 
 
-def write_png(output: RenderOutput, path: Path) -> Path:
+def over(output: RenderOutput, background: float) -> RenderOutput:
+    """Return an image that was rendered without a background over a grey one, display-referred."""
+    return dataclasses.replace(output, color=output.color + (1 - output.alpha[..., None]) * background)
+
+
+@dataclass(frozen=True)
+class PngSequence:
+    """PNG files for people: `folder/<camera>/<name>.<camera>.%04d.png`, display-referred, straight alpha."""
+
+    folder: Path
+    name: str = "avatar"
+
+    @property
+    def key(self) -> str:
+        """All settings that files depend on, besides their place."""
+        return self.name
+
+    def check(self, cameras: Sequence[Camera]) -> None:
+        """Accept any cameras."""
+
+    def write(self, pictures: Sequence[Picture], jobs: Sequence[str]) -> list[Path]:
+        """Write a frame's pictures; `jobs` are hashes of all that their files depend on."""
+        paths = [self._path(picture.frame, picture.camera.name) for picture in pictures]
+        for path, picture, job in zip(paths, pictures, jobs, strict=True):
+            write_png(delivered(picture), path, job=job)
+        return paths
+
+    def complete(self, frame: int, cameras: Sequence[str], jobs: Sequence[str], deep: bool) -> bool:
+        """Return whether a frame's files are there, whole, and from these very jobs; none is ever deep."""
+        return all(_is_of(self._path(frame, camera), job) for camera, job in zip(cameras, jobs, strict=True))
+
+    def _path(self, frame: int, camera: str) -> Path:
+        return self.folder / camera / f"{self.name}.{camera}.{frame:04d}.png"
+
+
+def write_png(output: RenderOutput, path: Path, *, job: str = "") -> Path:
     """Write an 8-bit sRGB PNG with straight (not premultiplied) alpha and return its path.
 
     Args:
         output: Rendered without a background.
         path: The file, which appears when it is complete; folders are made if missing.
+        job: Written into the file, if given.
     """
+    text = PngInfo()
+    if job:
+        text.add_text(_JOB, job)
     color, alpha = output.color.detach().cpu().numpy(), output.alpha.detach().cpu().numpy()
     coverage = alpha[..., None]
     straight = np.divide(color, coverage, out=np.zeros_like(color), where=coverage >= _MIN_ALPHA)
     with replacing(path) as draft:
-        Image.fromarray(_quantized(np.concatenate([straight, coverage], -1))).save(draft, format="PNG")
+        Image.fromarray(_quantized(np.concatenate([straight, coverage], -1))).save(
+            draft, format="PNG", pnginfo=text
+        )
     return path
+
+
+def delivered(picture: Picture) -> RenderOutput:
+    """Return the camera's own view: a PNG has no pixels beyond it."""
+    margin, output = picture.overscan, picture.output
+    if not margin:
+        return output
+    inside = slice(margin, -margin)
+    images = {
+        name: value for name, value in vars(output).items() if isinstance(value, Tensor) and value.ndim > 1
+    }
+    return dataclasses.replace(output, **{name: image[inside, inside] for name, image in images.items()})
+
+
+def _is_of(path: Path, job: str) -> bool:
+    """Return whether a PNG is whole and comes from a job."""
+    try:
+        # Readers do without the last chunk.
+        if not path.read_bytes().endswith(_LAST_CHUNK):
+            return False
+        with Image.open(path) as image:
+            image.load()
+            return image.info.get(_JOB) == job
+    except (OSError, UnidentifiedImageError, SyntaxError):
+        return False
 
 
 def _quantized(values: Float[np.ndarray, "h w c"]) -> UInt8[np.ndarray, "h w c"]:

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image, ImageDraw, ImageFont
 
+from dsar.drafts import replacing
 from dsar.errors import ExportError
-from dsar_render.drafts import replacing
 
 _TEXT_HEIGHT = 12
 _MARGIN = 4

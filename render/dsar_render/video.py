@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
+from dsar.drafts import replacing
 from dsar.errors import ExportError, MissingDependencyError
-from dsar_render.drafts import replacing
 
 
 def write_mp4(images: Iterable[UInt8[np.ndarray, "h w 3"]], path: Path, *, fps: float) -> Path:

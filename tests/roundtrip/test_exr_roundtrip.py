@@ -39,7 +39,7 @@ def test_channels_types_windows_and_compression(output, camera, tmp_path):
     assert spec.channelnames == ("R", "G", "B", "A", "Z")
     assert spec.channelformats == (oiio.HALF,) * 4 + (oiio.FLOAT,)
     assert (spec.width, spec.height, spec.full_width, spec.full_height) == (128, 96, 128, 96)
-    assert spec["compression"] == "zip"
+    assert spec["compression"] == "zips"
 
 
 def test_pixels_are_linear_and_premultiplied(output, camera, tmp_path):

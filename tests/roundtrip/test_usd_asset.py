@@ -13,8 +13,8 @@ from pxr import Gf, Usd, UsdGeom, UsdSkel, UsdVol, Vt
 from dsar.errors import ExportError
 from dsar.geometry.cameras import project
 from dsar.geometry.harmonics import C0
+from dsar.geometry.paths import turntable
 from dsar.geometry.rotations import matrix_from_axis_angle
-from dsar.geometry.turntable import turntable
 from dsar.raster import rasterize
 from dsar.types import Camera, Gaussians
 from dsar_exporters import find_faults, write_usd
@@ -241,7 +241,7 @@ def camera_pixels(
 
 def test_every_camera_projects_to_a_hundredth_of_a_pixel(stage, figure, front):
     circling = turntable(figure.binding, figure.frame_numbers, figure.fps, width=192, height=256)
-    for camera, (frame, gaussians) in zip(circling, figure, strict=True):
+    for camera, (frame, gaussians) in zip(circling.cameras, figure, strict=True):
         for path, ours in (("front", front), ("turntable", camera)):
             prim = stage.GetPrimAtPath(f"/anna/cameras/{path}")
             size = prim.GetCustomDataByKey("dsar:resolution")
@@ -256,7 +256,8 @@ def test_the_turntable_starts_in_front_and_turns_once_in_eight_seconds(figure):
     binding = dataclasses.replace(figure.binding, T_world_rest=figure.binding.T_world_rest[[0, 0, 0, 0]])
 
     def place(frame: int) -> torch.Tensor:
-        (camera, *_) = turntable(binding, [frame, 1, 2, 3], 24.0, width=64, height=64)
+        frames = range(frame, frame + 4)
+        camera = turntable(binding, frames, 24.0, width=64, height=64).at(frame)
         return camera.center - binding.T_world_rest[0, 0, :3, 3]
 
     assert place(1001)[2] > 3

@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from dsar_exporters.color import interop_id, linear_from_srgb, linear_premultiplied
+from dsar.color import linear_from_srgb
+from dsar_exporters.color import ColorTarget
 
 
 def test_srgb_curve_has_its_published_values():
@@ -12,19 +13,19 @@ def test_srgb_curve_has_its_published_values():
 
 def test_partial_coverage_keeps_the_colour_and_scales_its_light():
     color = np.full((2, 2, 3), 0.8, np.float32)
-    full = linear_premultiplied(color, np.ones((2, 2), np.float32), "lin_rec709_scene")
+    full = ColorTarget().premultiplied(color, np.ones((2, 2), np.float32))
     alpha = np.array([[0.5, 0.25], [1e-3, 0.0]], np.float32)
-    part = linear_premultiplied(color * alpha[..., None], alpha, "lin_rec709_scene")
+    part = ColorTarget().premultiplied(color * alpha[..., None], alpha)
     np.testing.assert_allclose(part, full * alpha[..., None], rtol=1e-5)
 
 
 @pytest.mark.parametrize("alias", ["ACEScg", "lin_ap1_scene", "scene_linear"])
 def test_aliases_and_roles_share_one_interop_id(alias):
-    assert interop_id(alias) == "lin_ap1_scene"
+    assert ColorTarget(alias).interop_id == "lin_ap1_scene"
 
 
 def test_ocio_agrees_that_our_decoding_is_linear_rec709():
     # Back to encoded sRGB through OCIO must give what went in.
     color = np.random.default_rng(0).random((4, 5, 3), np.float32)
-    encoded = linear_premultiplied(color, np.ones((4, 5), np.float32), "srgb_rec709_scene")
+    encoded = ColorTarget("srgb_rec709_scene").premultiplied(color, np.ones((4, 5), np.float32))
     np.testing.assert_allclose(encoded, color, atol=1e-4)

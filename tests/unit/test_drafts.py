@@ -1,17 +1,12 @@
+import subprocess
+import sys
+
 import pytest
 
-import dsar_exporters.drafts
-import dsar_render.drafts
-
-packages = pytest.mark.parametrize(
-    "replacing",
-    [dsar_exporters.drafts.replacing, dsar_render.drafts.replacing],
-    ids=["exporters", "render"],
-)
+from dsar.drafts import replacing
 
 
-@packages
-def test_a_finished_draft_replaces_the_file_and_makes_its_folder(replacing, tmp_path):
+def test_a_finished_draft_replaces_the_file_and_makes_its_folder(tmp_path):
     path = tmp_path / "new" / "image.exr"
     for contents in ("first", "second"):
         with replacing(path) as draft:
@@ -21,9 +16,8 @@ def test_a_finished_draft_replaces_the_file_and_makes_its_folder(replacing, tmp_
     assert list(path.parent.iterdir()) == [path]
 
 
-@packages
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
-def test_an_interrupted_draft_leaves_the_old_file_and_nothing_else(replacing, tmp_path, error):
+def test_an_interrupted_draft_leaves_the_old_file_and_nothing_else(tmp_path, error):
     path = tmp_path / "image.exr"
     path.write_text("old")
 
@@ -36,3 +30,26 @@ def test_an_interrupted_draft_leaves_the_old_file_and_nothing_else(replacing, tm
         write_half()
     assert list(tmp_path.iterdir()) == [path]
     assert path.read_text() == "old"
+
+
+_KILLED = """
+import os, signal, sys
+from pathlib import Path
+from dsar.drafts import replacing
+with replacing(Path(sys.argv[1])) as draft:
+    draft.write_text("half")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_drafts_of_killed_processes_are_swept_and_those_of_others_are_not(tmp_path):
+    path = tmp_path / "image.1001.exr"
+    subprocess.run([sys.executable, "-c", _KILLED, str(path)], check=False)
+    elsewhere = tmp_path / ".image.1002.exr.another_machine-1-abc"
+    elsewhere.mkdir()
+    (left,) = (each for each in tmp_path.iterdir() if each != elsewhere)
+    assert (left / "draft").read_text() == "half"
+    with replacing(tmp_path / "image.1003.exr") as draft:
+        draft.write_text("whole")
+        assert len(list(tmp_path.iterdir())) == 2
+    assert sorted(tmp_path.iterdir()) == [elsewhere, tmp_path / "image.1003.exr"]

@@ -262,7 +262,7 @@ def test_distant_splats_keep_their_light_when_antialiased(backend):
     assert draw(gaussian, camera, backend, dilation=0.5).alpha.sum() > 5 * light
 
 
-EXTRAS = ("median_depth", "contributors")
+EXTRAS = ("median_depth", "front_depth", "heaviest", "contributors")
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -291,6 +291,8 @@ def test_extra_outputs_equal_the_reference(scene, backend):
     )
     # A fragment right at a cut-off may fall on either side of it.
     assert (fast.contributors.counts != slow.contributors.counts).float().mean() < 0.01
+    assert (fast.heaviest != slow.heaviest).float().mean() < 0.01
+    assert (~((fast.front_depth - slow.front_depth).abs() <= 1e-4)).float().mean() < 0.01
     assert (~((fast.median_depth - slow.median_depth).abs() <= 1e-4)).float().mean() < 0.01
     same = (fast.contributors.counts == slow.contributors.counts).all(1)
     rows = [
@@ -301,6 +303,20 @@ def test_extra_outputs_equal_the_reference(scene, backend):
         for output in (slow, fast)
     ]
     assert all(one == other for one, other, equal in zip(*rows, same, strict=True) if equal)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("scene", ["random", "saturated", "empty"])
+def test_the_first_and_the_heaviest_gaussian_are_those_of_the_list(backend, scene):
+    gaussians = SCENES[scene].map(Tensor.float)
+    output = draw(gaussians, make_camera(), backend, outputs=EXTRAS)
+    counts, ids, weights = (getattr(output.contributors, name) for name in ("counts", "ids", "weights"))
+    for pixel, (shares, mine) in enumerate(
+        zip(weights.split(counts.flatten().tolist()), ids.split(counts.flatten().tolist()), strict=True)
+    ):
+        heaviest, front = output.heaviest.flatten()[pixel], output.front_depth.flatten()[pixel]
+        assert heaviest == (mine[shares.argmax()] if len(mine) else -1)
+        assert front == pytest.approx(float(gaussians.means[mine[0], 2]) if len(mine) else 0.0, abs=1e-5)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -346,7 +362,7 @@ def test_images_and_gradients_are_bitwise_equal_for_any_number_of_threads(monkey
             SCENES[scene], make_camera(), "cpu", torch.float32, antialiased=True
         )
         extras = draw(SCENES[scene].map(Tensor.float), make_camera(), "cpu", outputs=EXTRAS)
-        images |= {"median": extras.median_depth} | vars(extras.contributors)
+        images |= {name: getattr(extras, name) for name in EXTRAS[:3]} | vars(extras.contributors)
         runs.append((images, gradients))
     for images, gradients in runs[1:]:
         assert all(torch.equal(image, runs[0][0][name]) for name, image in images.items())
@@ -404,7 +420,7 @@ gaussians = Gaussians(
     torch.rand(50), torch.rand(50, 16, 3),
 ).map(torch.Tensor.requires_grad_)
 camera = Camera(torch.tensor([[40.0, 0, 20], [0, 40, 15], [0, 0, 1]]), torch.eye(4), 40, 30, "front")
-for extras in ((), ("median_depth", "contributors")):
+for extras in ((), ("median_depth", "heaviest", "contributors")):
     rasterize(gaussians, camera, antialiased=True, outputs=extras).color.sum().backward()
 assert len(kernels) >= 6 and min(loaded) == 1, loaded
 assert [len(kernel.signatures) for kernel in kernels] == loaded
@@ -451,7 +467,9 @@ def test_inputs_that_do_not_fit_are_refused():
         rasterize(dataclasses.replace(gaussians, means=gaussians.means.double()), camera)
     with pytest.raises(ConfigError, match="no camera gradients"):
         rasterize(gaussians, dataclasses.replace(camera, K=camera.K.clone().requires_grad_()))
-    with pytest.raises(ConfigError, match="outputs can be median_depth, contributors; found normals"):
+    with pytest.raises(
+        ConfigError, match="outputs can be median_depth, front_depth, heaviest, contributors; found normals"
+    ):
         _check_outputs(["normals"])
     with pytest.raises(ConfigError, match="float32 tensors on a GPU, not"):
         rasterize(gaussians, camera, backend="cuda")

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar
 
+from dsar.drafts import replacing
 from dsar.types import Gaussians, GaussianSequence
 from dsar_exporters.checks import check_file_name
 from dsar_exporters.delivery import Sink
-from dsar_exporters.drafts import replacing
 from dsar_exporters.manifest import write_manifest
 
 _logger = logging.getLogger(__name__)

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from dsar.drafts import replacing
 from dsar.errors import ExportError
 from dsar.geometry.harmonics import C0
 from dsar.types import Gaussians, GaussianSequence
 from dsar_exporters.delivery import Sink
-from dsar_exporters.drafts import replacing
 from dsar_exporters.manifest import manifest_path, write_manifest
 from dsar_exporters.optional import require
 

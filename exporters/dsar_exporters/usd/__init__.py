@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from dsar.errors import ExportError, MissingDependencyError
-from dsar.geometry.turntable import TURNTABLE
+from dsar.geometry.paths import TURNTABLE, CameraPath
 from dsar.types import Camera, Gaussians, GaussianSequence
 from dsar_exporters.checks import check_cameras, check_name
 from dsar_exporters.delivery import Sink, export
@@ -70,6 +70,39 @@ def write_usd(
     """
     export(sequence, [UsdAsset(path, name, cameras=cameras, half=half, clips=clips)])
     return path
+
+
+def read_usd_cameras(
+    path: Path,
+    *,
+    frames: Sequence[int],
+    resolution: tuple[int, int] | None = None,
+    fps: float | None = None,
+) -> list[CameraPath]:
+    """Read every camera of a USD stage, ours or anyone's, in the stage's order.
+
+    What moves, be it the camera, a parent or the lens, is keyed at the frames and their neighbours; all else
+    is at rest. Time codes are frame numbers. The stage's unit and up axis are converted to ours, and scale is
+    taken off. A camera is called as its prim, in files of Blender and Maya that give it two as its object,
+    and led by its parent's name where that is not unique.
+
+    Args:
+        path: A `.usda`, `.usdc`, `.usd` or `.usdz`; all its payloads are loaded.
+        frames: Frame numbers at which the cameras will be asked for, at least one.
+        resolution: Width and height of the pictures; without it those that our own files note. Where their
+            aspect is, to a hundredth, the aperture's or the note's, the picture shows the aperture; else the
+            aperture's width is the picture's and pixels are square, as with `usdrecord`.
+        fps: Frames per second of the frame numbers.
+
+    Raises:
+        ExportError: It is no USD file or has no camera; a camera has no resolution, is not perspective,
+            mirrored or sheared, or moves at another rate than `fps`.
+        MissingDependencyError: usd-core is not installed.
+    """
+    require("pxr.UsdGeom", feature="USD", package="usd-core>=26.3", extra="usd")
+    from dsar_exporters.usd.camera_reader import read_cameras
+
+    return read_cameras(path, frames, resolution, fps)
 
 
 @dataclass(frozen=True)

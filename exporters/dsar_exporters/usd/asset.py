@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float32
 from pxr import Kind, Sdf, Usd, UsdGeom, Vt
 
-from dsar.geometry.turntable import TURNTABLE, turntable
+from dsar.geometry.paths import TURNTABLE, turntable
 from dsar.types import Camera, Gaussians, GaussianSequence
 from dsar_exporters.usd.body import BODY, MESH, BodyWriter
 from dsar_exporters.usd.cameras import define_camera, placement
@@ -205,8 +205,8 @@ class AssetWriter:
             circling = turntable(
                 sequence.binding, sequence.frame_numbers, sequence.fps, width=width, height=height
             )
-            place = define_camera(self._data, f"/{TURNTABLE}", circling[0])
-            for frame, camera in zip(sequence.frame_numbers, circling, strict=True):
+            place = define_camera(self._data, f"/{TURNTABLE}", circling.cameras[0])
+            for frame, camera in zip(circling.frames, circling.cameras, strict=True):
                 self._layer.sample(place, frame, placement(camera))
             self._as_data(f"/{TURNTABLE}")
             prim = self._stage.DefinePrim(scope.GetPath().AppendChild(TURNTABLE))

@@ -14,9 +14,10 @@ import torch
 from jaxtyping import Float16, Float32, Int64
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdVol, Vt
 
+from dsar.color import linear_from_srgb
 from dsar.geometry.harmonics import C0
 from dsar.types import Binding, Gaussians
-from dsar_exporters.color import LINEAR_REC709, linear_from_srgb
+from dsar_exporters.color import LINEAR_REC709
 from dsar_exporters.usd.timeline import Timeline, Values
 
 INSTANCER, SPLATS = "instancer", "splats"

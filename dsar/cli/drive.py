@@ -1,0 +1,88 @@
+"""What `dsar export` and `dsar render` share: a trained avatar and the motion that drives it."""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from dsar.cli.common import Common, capture_sequence
+from dsar.types import Camera, GaussianSequence, Motion
+
+if TYPE_CHECKING:
+    from dsar.avatar.avatar import Avatar
+
+
+@dataclass(frozen=True)
+class Performance:
+    """An avatar, a motion at its rate, and where both come from."""
+
+    avatar: "Avatar"
+    motion: Motion
+    cameras: tuple[Camera, ...]
+    """Those of the capture."""
+    provenance: dict[str, str]
+
+    def roll_out(self, frames: Sequence[int] | None = None) -> GaussianSequence:
+        """Return the Gaussians of some frames, all by default."""
+        from dsar.avatar import roll_out
+
+        return roll_out(self.avatar, self.motion, frames=frames, provenance=self.provenance)
+
+
+@dataclass(frozen=True)
+class Drive(Common):
+    """Flags of commands that drive a trained avatar."""
+
+    run_folder: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(name="run")] = None
+    """Run folder; default: the newest under runs/."""
+    motion: str = "test"
+    """An AMASS/SMPL-X .npz or .bvh file, a sequence of the run's capture, or its split `test` or `train`."""
+    frames: str | None = None
+    """Frame numbers from 1001 on, e.g. 1001-1100x2; default: all."""
+
+    def wanted_frames(self) -> list[int] | None:
+        """Return the frames that are asked for, None for all."""
+        from dsar_exporters import parse_frames
+
+        return None if self.frames is None else parse_frames(self.frames)
+
+    def chosen_run(self) -> Path:
+        """Return the run folder: the one named, else the newest."""
+        from dsar.training.checkpoint import newest_run
+
+        return self.run_folder or newest_run().folder
+
+    def open(self) -> Performance:
+        """Return the avatar and its motion."""
+        from dsar.avatar.rollout import START_FRAME
+        from dsar.data.capture import capture_of
+        from dsar.data.motion import read_motion, resample
+        from dsar.data.novelty import report_novelty
+        from dsar.training.checkpoint import Run, load_checkpoint
+
+        self.check_device()
+        avatar, config, provenance = load_checkpoint(Run(self.chosen_run()))
+        capture = capture_of(config)
+        name = capture_sequence(capture, self.motion)
+        if name is not None:
+            motion = capture.motions[name]
+        else:
+            motion = read_motion(Path(self.motion), avatar.body)
+        if motion.fps != avatar.fps:
+            motion = resample(motion, avatar.fps)
+        if name is None:
+            known = [capture.motions[trained] for trained in capture.splits["train"]]
+            report_novelty(avatar.body, motion, known, START_FRAME)
+        provenance["motion_hash"] = _hash(motion)
+        return Performance(avatar, motion, tuple(capture.cameras), provenance)
+
+
+def _hash(motion: Motion) -> str:
+    """Return a hash of the poses: a file may change and keep its name."""
+    digest = hashlib.sha256()
+    for values in (motion.rotations, motion.translations):
+        digest.update(values.cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()[:16]

@@ -1,0 +1,100 @@
+"""`dsar export`."""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from dsar.cli.common import shown
+from dsar.cli.drive import Drive
+from dsar.errors import ConfigError
+from dsar.types import Camera
+
+if TYPE_CHECKING:
+    from dsar_exporters import Output
+
+
+@dataclass(frozen=True)
+class Export(Drive):
+    """Drive an avatar with a motion and write the Gaussians of each frame."""
+
+    usd: Path | None = None
+    """USD asset: .usda or .usdc."""
+    ply: Path | None = None
+    """Folder of 3DGS splat files, one per frame."""
+    compressed_ply: Path | None = None
+    """Folder of PlayCanvas's compressed PLY files, one per frame."""
+    spz: Path | None = None
+    """Folder of SPZ files, one per frame."""
+    glb: Path | None = None
+    """glTF file with KHR_gaussian_splatting: the first frame."""
+    half: bool = False
+    """USD: write splats in 16 bits where that is enough (not positions)."""
+    clips: bool = False
+    """USD: one value clip a frame, for shots of many gigabytes."""
+    sh_degree: int | None = None
+    """PLY: pad the harmonics with zeros to this degree, for viewers that insist on one."""
+    name: str = "avatar"
+    """Name of the asset and of the files."""
+    check: Path | None = None
+    """Write nothing; say what is wrong with this file, whoever wrote it (USD, PLY or SPZ)."""
+
+    def run(self) -> None:
+        """Write every requested format from one rollout, or check a file."""
+        if self.check is not None:
+            self.run_check(self.check)
+            return
+        from dsar_exporters import export
+
+        if not self.places():
+            raise ConfigError(
+                "dsar export: nothing to write; give --usd out.usda, --ply DIR, --compressed-ply DIR, "
+                "--spz DIR, --glb FILE or --check FILE"
+            )
+        wanted = self.wanted_frames()
+        performance = self.open()
+        sequence = performance.roll_out(wanted)
+        outputs = self.outputs(performance.cameras)
+        delivered = export(shown(sequence, self.progress, "export"), list(outputs.values()))
+        facts = {"gaussians": sequence.num_gaussians, "frames": len(sequence), "fps": sequence.fps}
+        written = {name: str(output.path) for name, output in outputs.items()}
+        files = {
+            name: {"files": each.files, "bytes": each.size, "seconds": each.seconds}
+            for name, each in zip(outputs, delivered, strict=True)
+        }
+        self.write_json({"motion": performance.motion.name, "written": written, "cost": files, **facts})
+
+    def places(self) -> list[Path]:
+        """Return where something is to be written."""
+        wanted = (self.usd, self.ply, self.compressed_ply, self.spz, self.glb)
+        return [place for place in wanted if place is not None]
+
+    def outputs(self, cameras: Sequence[Camera]) -> "dict[str, Output]":
+        """Return the requested formats by the name of their flag."""
+        from dsar_exporters import CompressedPlySequence, GltfSnapshot, PlySequence, SpzSequence, UsdAsset
+
+        wanted: dict[str, Output] = {}
+        if self.usd is not None:
+            wanted["usd"] = UsdAsset(self.usd, self.name, cameras=cameras, half=self.half, clips=self.clips)
+        if self.ply is not None:
+            wanted["ply"] = PlySequence(self.ply, self.name, sh_degree=self.sh_degree)
+        if self.compressed_ply is not None:
+            wanted["compressed_ply"] = CompressedPlySequence(self.compressed_ply, self.name)
+        if self.spz is not None:
+            wanted["spz"] = SpzSequence(self.spz, self.name)
+        if self.glb is not None:
+            wanted["glb"] = GltfSnapshot(self.glb)
+        return wanted
+
+    def run_check(self, path: Path) -> None:
+        """Print what is wrong with a file; exit with 2 where something is."""
+        from dsar_exporters import find_faults
+
+        faults = find_faults(path)
+        self.write_json({"file": str(path), "faults": faults})
+        for fault in faults:
+            sys.stdout.write(f"WRONG {fault}\n")
+        sys.stdout.write(f"{path}: {len(faults) or 'no'} fault{'s' if len(faults) != 1 else ''}\n")
+        if faults:
+            raise SystemExit(2)

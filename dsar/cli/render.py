@@ -1,0 +1,233 @@
+"""`dsar render`."""
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from dsar.cli.drive import Drive, Performance
+from dsar.console import follow
+from dsar.errors import ConfigError
+from dsar.geometry.camera_files import read_cameras_json
+from dsar.geometry.paths import DOLLY, ORBIT, TURNTABLE, CameraPath, dolly, orbit, turntable
+
+if TYPE_CHECKING:
+    from dsar_render import RenderSettings, Shot
+    from dsar_render.shot import PictureWriter
+
+_MADE = {TURNTABLE: turntable, ORBIT: orbit, DOLLY: dolly}
+
+
+@dataclass(frozen=True)
+class Render(Drive):
+    """Drive an avatar with a motion and render image sequences."""
+
+    exr: Path | None = None
+    """Folder of EXR sequences: DIR/<camera>/<name>.<camera>.%04d.exr."""
+    png: Path | None = None
+    """Folder of PNG sequences, display-referred with alpha."""
+    mp4: Path | None = None
+    """Video of the chosen cameras side by side, over white."""
+    camera: str = "all"
+    """Cameras by name or pattern, with commas (`cam0?,cam12`); `all`; or one made for the motion: `turntable`
+    (goes with the person), `orbit` (stays), `dolly` (moves in)."""
+    cameras: Path | None = None
+    """JSON or USD file whose cameras take the place of the capture's."""
+    res: tuple[int, int] | None = None
+    """Width and height in pixels; default: the camera's own."""
+    overscan: int = 0
+    """EXR: pixels rendered beyond each side of the image."""
+    crop: bool = False
+    """EXR: keep only the pixels around the person (data window)."""
+    aov: str = "rgba,Z"
+    """EXR: output variables, with commas, of rgba, alpha, Z, N, P, motion, id, crypto."""
+    deep: bool = False
+    """EXR: also deep images, <name>_deep.<camera>.%04d.exr."""
+    deep_max_samples: int = 32
+    """Samples of a deep pixel at most."""
+    colorspace: str = "lin_rec709_scene"
+    """EXR: colour space (a name, alias or role of the OCIO configuration, such as ACEScg)."""
+    ocio: Path | None = None
+    """OCIO configuration; default: $OCIO, else the built-in one."""
+    exr_compression: Literal["none", "rle", "zips", "zip", "piz", "pxr24", "b44", "b44a", "dwaa", "dwab"] = (
+        "zips"
+    )
+    """Of colours; data channels are never compressed lossily."""
+    exr_views: Literal["separate", "multipart"] = "separate"
+    """A file for each camera, or all cameras as parts of one: DIR/<name>.%04d.exr."""
+    motion_samples: int = 1
+    """Images averaged while the shutter is open."""
+    shutter: tuple[float, float] = (0.0, 0.0)
+    """When the shutter opens and closes, in frames, e.g. -0.25 0.25."""
+    jobs: int = 1
+    """Processes that draw and write."""
+    scheduler: str | None = None
+    """Dask cluster that draws and writes instead: tcp://HOST:PORT."""
+    skip_existing: bool = False
+    """Leave frames alone whose files are there, whole, and from this very job."""
+    openjd: Path | None = None
+    """Render nothing; write an OpenJobDescription template that renders this in chunks on a farm."""
+    chunk: int = 10
+    """OpenJD: frames of a task."""
+    name: str = "avatar"
+    """Name in the files."""
+
+    def run(self) -> None:
+        """Render every chosen camera and write every requested format."""
+        import torch
+
+        from dsar_render import Shot
+
+        if self.exr is None and self.png is None and self.mp4 is None:
+            raise ConfigError("dsar render: nothing to write; give --exr DIR, --png DIR or --mp4 FILE")
+        # With more threads sums are added in another order, and bytes would depend on the number of cores.
+        torch.set_num_threads(1)
+        wanted = self.wanted_frames()
+        settings = self.settings()
+        writers = tuple(self.writers())
+        performance = self.open()
+        whole = performance.roll_out()
+        frames = wanted or list(whole.frame_numbers)
+        performance.roll_out(frames)  # names frames that are not in the motion
+        paths = self.paths(performance, frames)
+        shot = Shot(tuple(paths), writers, settings, previews=self.mp4 is not None)
+        if self.openjd is not None:
+            self.write_template(self.openjd, frames)
+            return
+        rendered = self.render(performance, shot, frames)
+        self.write_json(
+            {
+                "motion": performance.motion.name,
+                "images": rendered * len(paths),
+                "skipped": (len(frames) - rendered) * len(paths),
+                "cameras": [path.name for path in paths],
+            }
+        )
+
+    def render(self, performance: Performance, shot: "Shot", frames: Sequence[int]) -> int:
+        """Render what is not there yet; return how many frames that was."""
+        from dsar_render import render_shot, with_neighbours, write_mp4
+
+        whole = performance.roll_out()
+        facts = dict(whole.provenance)
+        # A video needs every frame.
+        if self.skip_existing and self.mp4 is None:
+            frames = [frame for frame in frames if not shot.complete(frame, facts)]
+        if not frames:
+            return 0
+        every = whole.frame_numbers
+        rolled = with_neighbours(frames, every[0], every[-1]) if shot.settings.needs_neighbours else frames
+        sequence = performance.roll_out(rolled)
+        done = render_shot(shot, sequence, frames, jobs=self.jobs, scheduler=self.scheduler)
+        shown = follow(done, len(frames), self.progress, "render")
+        if self.mp4 is None:
+            for _ in shown:
+                pass
+        else:
+            write_mp4((image for _, image in shown if image is not None), self.mp4, fps=sequence.fps)
+        return len(frames)
+
+    def settings(self) -> "RenderSettings":
+        """Return what a picture is made of."""
+        from dsar_render import RenderSettings
+
+        # PNG and MP4 need no more than colours.
+        aovs = tuple(self.aov.split(",")) if self.exr is not None else ("rgba",)
+        return RenderSettings(
+            aovs=aovs,  # pyright: ignore[reportArgumentType]
+            deep=self.deep and self.exr is not None,
+            deep_max_samples=self.deep_max_samples,
+            motion_samples=self.motion_samples,
+            shutter=self.shutter,
+            overscan=self.overscan,
+        )
+
+    def writers(self) -> "Iterator[PictureWriter]":
+        """Yield what pictures become."""
+        from dsar_exporters import ColorTarget, ExrSequence, ocio_config
+        from dsar_render import PngSequence
+
+        if self.exr is not None:
+            target = ColorTarget(self.colorspace, ocio_config(self.ocio))
+            layers = tuple(self.aov.split(","))
+            how = {"compression": self.exr_compression, "views": self.exr_views, "crop": self.crop}
+            yield ExrSequence(self.exr.absolute(), self.name, layers, target, **how)
+        if self.png is not None:
+            yield PngSequence(self.png.absolute(), self.name)
+
+    def paths(self, performance: Performance, frames: Sequence[int]) -> list[CameraPath]:
+        """Return the cameras to render, at the requested resolution."""
+        whole = performance.roll_out()
+        rig = self.rig(performance, frames)
+        found: list[CameraPath] = []
+        for wanted in self.camera.split(","):
+            if wanted in _MADE and wanted not in [path.name for path in rig]:
+                assert whole.binding is not None
+                width, height = self.res or (rig[0].cameras[0].width, rig[0].cameras[0].height)
+                size = {"width": width, "height": height}
+                found.append(_MADE[wanted](whole.binding, whole.frame_numbers, whole.fps, **size))
+                continue
+            pattern = "*" if wanted == "all" else wanted
+            chosen = [path for path in rig if fnmatchcase(path.name, pattern)]
+            if not chosen:
+                names = ", ".join(path.name for path in rig)
+                raise ConfigError(f"--camera {wanted}: expected all, {', '.join(_MADE)}, or some of {names}")
+            named = {path.name for path in found}
+            found += [path for path in chosen if path.name not in named]
+        sized = [path.resized(*self.res) if self.res else path for path in found]
+        self.check_together(sized)
+        return sized
+
+    def rig(self, performance: Performance, frames: Sequence[int]) -> list[CameraPath]:
+        """Return the cameras to choose from: the capture's, or a file's."""
+        if self.cameras is None:
+            return [CameraPath((camera,)) for camera in performance.cameras]
+        if self.cameras.suffix.lower() in (".usd", ".usda", ".usdc", ".usdz"):
+            from dsar_exporters import read_usd_cameras
+
+            fps = performance.motion.fps
+            return read_usd_cameras(self.cameras, frames=frames, resolution=self.res, fps=fps)
+        return read_cameras_json(self.cameras)
+
+    def check_together(self, paths: Sequence[CameraPath]) -> None:
+        """Check what the chosen cameras have to have in common."""
+        views = [path.cameras[0] for path in paths]
+        for writer in self.writers():
+            writer.check(views)
+        if self.mp4 is not None and len({view.height for view in views}) > 1:
+            raise ConfigError(
+                "--mp4: expected cameras of one height, found several: give one size with --res W H"
+            )
+
+    def write_template(self, path: Path, frames: Sequence[int]) -> None:
+        """Write the farm's job."""
+        from dsar.training.checkpoint import write_whole
+        from dsar_render import openjd_template
+
+        command = ["dsar", "render", *self.arguments()]
+        write_whole(path, openjd_template(self.name, command, frames, chunk=self.chunk))
+
+    def arguments(self) -> list[str]:
+        """Return the arguments that make this command, but for which frames, with absolute paths."""
+        motion = Path(self.motion)
+        found = [str(self.chosen_run().absolute())]
+        found += ["--motion", str(motion.absolute() if motion.is_file() else motion)]
+        left_out = ("run_folder", "motion", "frames", "openjd", "chunk", "json", "progress", "skip_existing")
+        for each in dataclasses.fields(self):
+            value = getattr(self, each.name)
+            if each.name in left_out or value == each.default:
+                continue
+            flag = f"--{each.name.replace('_', '-')}"
+            found += [flag] if value is True else [flag, *map(_absolute, _listed(value))]
+        # A task that is given out again goes on where it was cut off.
+        return [*found, "--skip-existing"]
+
+
+def _listed(value: object) -> Sequence[object]:
+    return value if isinstance(value, tuple) else (value,)
+
+
+def _absolute(value: object) -> str:
+    return str(value.absolute()) if isinstance(value, Path) else str(value)

@@ -1,0 +1,285 @@
+"""Cameras of any USD stage as ours: the inverse of `cameras`.
+
+Imports pxr: only `dsar_exporters.usd` imports this module, when it reads.
+"""
+
+# pxr is compiled and carries no type stubs.
+# pyright: reportAttributeAccessIssue=false
+
+import logging
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from pxr import Gf, Tf, Usd, UsdGeom
+
+from dsar.errors import ExportError
+from dsar.geometry.paths import CameraPath
+from dsar.geometry.rotations import nearest_rotation
+from dsar.types import Camera
+
+_logger = logging.getLogger(__name__)
+
+_OBJECT_NAME = "userProperties:blender:object_name"
+"""Blender writes its object as an Xform and the object's data as a prim within."""
+_FITS = 0.01
+"""How far the aspects of aperture and picture may differ and mean the same: rounding to whole pixels."""
+_RIGID_TOLERANCE = 1e-4
+_SAME_RATE = 2e-4
+"""Relative: 23.976 is 24000/1001."""
+_Y_UP_FROM_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+_STATE = 5
+"""Numbers of a lens, before the sixteen of its place."""
+
+
+def read_cameras(
+    path: Path, frames: Sequence[int], resolution: tuple[int, int] | None, fps: float | None
+) -> list[CameraPath]:
+    """Read cameras; see `dsar_exporters.usd.read_usd_cameras`."""
+    stage = _open(path)
+    _mend_types(stage)
+    every = Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies())
+    prims = [prim for prim in every if prim.IsA(UsdGeom.Camera)]
+    if not prims:
+        raise ExportError(f"{path}: expected cameras, found none: export them too, or name another file")
+    if not stage.HasAuthoredMetadata("metersPerUnit"):
+        _logger.warning("%s: says no metersPerUnit; read in centimetres, as USD has it", path)
+    return [
+        _CameraReader(prim, name, f"{path}, camera {prim.GetPath()}").read(frames, resolution, fps)
+        for prim, name in zip(prims, _names(prims), strict=True)
+    ]
+
+
+class _CameraReader:
+    """One camera prim, and how errors call it."""
+
+    def __init__(self, prim: Usd.Prim, name: str, where: str) -> None:
+        self._prim, self._name, self._where = prim, name, where
+        self._schema = UsdGeom.Camera(prim)
+        self._placed = [UsdGeom.Xformable(p) for p in _with_ancestors(prim) if p.IsA(UsdGeom.Xformable)]
+        self._lens = [
+            self._schema.GetFocalLengthAttr(),
+            self._schema.GetHorizontalApertureAttr(),
+            self._schema.GetVerticalApertureAttr(),
+            self._schema.GetHorizontalApertureOffsetAttr(),
+            self._schema.GetVerticalApertureOffsetAttr(),
+        ]
+
+    def read(
+        self, frames: Sequence[int], resolution: tuple[int, int] | None, fps: float | None
+    ) -> CameraPath:
+        """Return the camera: at rest, or keyed at the frames and their neighbours."""
+        size = self._size(resolution)
+        keys = sorted({frame + step for frame in frames for step in (-1, 0, 1)})
+        states = self._states(keys[:1])
+        if self._may_move() and self._moves_with(keys, fps):
+            states = self._states(keys)
+        cameras = tuple(self._camera(state, size) for state in states)
+        return CameraPath(cameras, tuple(keys) if len(cameras) > 1 else ())
+
+    def _may_move(self) -> bool:
+        return any(attribute.ValueMightBeTimeVarying() for attribute in self._lens) or any(
+            each.TransformMightBeTimeVarying() for each in self._placed
+        )
+
+    def _moves_with(self, keys: Sequence[int], fps: float | None) -> bool:
+        """Return whether the camera moves at the keys; complain where it does so at others, or at a rate."""
+        if _constant(self._states([*keys, *self._sample_times()])):
+            return False
+        rate = _rate(self._prim.GetStage())
+        if rate is not None and fps is not None and abs(rate / fps - 1) > _SAME_RATE:
+            raise ExportError(
+                f"{self._where}: expected the motion's {fps:g} frames per second, found {rate:g} time codes "
+                f"per second, and the camera moves: export it at {fps:g} frames per second"
+            )
+        if not _constant(self._states(keys)):
+            return True
+        times = self._sample_times()
+        span = f"{times[0]:g} to {times[-1]:g}" if times else "other times"
+        _logger.warning("%s: moves at %s, stands still at %d to %d", self._where, span, keys[0], keys[-1])
+        return False
+
+    def _sample_times(self) -> list[float]:
+        return sorted({time for each in (*self._lens, *self._placed) for time in each.GetTimeSamples()})
+
+    def _states(self, times: Sequence[float | int]) -> Float[np.ndarray, "t 21"]:
+        """Return lens and place at times: focal length, apertures, their offsets, local-to-world matrix."""
+        # Also what stands still is read at a time: single samples are at no default.
+        views = [self._schema.GetCamera(Usd.TimeCode(time)) for time in times]
+        if any(view.projection != Gf.Camera.Perspective for view in views):
+            raise ExportError(
+                f"{self._where}: expected a perspective camera, found an orthographic one: make it "
+                "perspective, or deactivate or delete it"
+            )
+        return np.array(
+            [
+                [
+                    *(view.focalLength, view.horizontalAperture, view.verticalAperture),
+                    *(view.horizontalApertureOffset, view.verticalApertureOffset),
+                    *np.array(view.transform).ravel(),
+                ]
+                for view in views
+            ]
+        )
+
+    def _camera(self, state: Float[np.ndarray, "21"], size: tuple[int, int]) -> Camera:
+        intrinsics = torch.from_numpy(self._intrinsics(state[:_STATE], size)).float()
+        transform = torch.from_numpy(self._transform(state[_STATE:].reshape(4, 4))).float()
+        return Camera(intrinsics, transform, *size, self._name)
+
+    def _intrinsics(self, lens: Float[np.ndarray, "5"], size: tuple[int, int]) -> Float[np.ndarray, "3 3"]:
+        focal, horizontal, vertical, right, up = lens
+        if not (lens[:3] > 0).all():
+            raise ExportError(
+                f"{self._where}: expected focalLength, horizontalAperture and verticalAperture > 0, found "
+                f"{focal:g}, {horizontal:g} and {vertical:g}: set its lens"
+            )
+        width, height = size
+        fx = fy = width * focal / horizontal
+        if self._fits(horizontal / vertical, width / height):
+            fy = height * focal / vertical
+        cx, cy = width / 2 - right * fx / focal, height / 2 + up * fy / focal
+        return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+    def _fits(self, aperture: float, picture: float) -> bool:
+        """Return whether the picture shows all of the aperture, else its width alone counts.
+
+        Pixels that are not square make the aspects differ; the resolution that we note tells of them.
+        """
+        own = self._noted()
+        aspects = [aperture] if own is None else [aperture, own[0] / own[1]]
+        return any(abs(aspect / picture - 1) <= _FITS for aspect in aspects)
+
+    def _noted(self) -> tuple[int, int] | None:
+        """Return the resolution that `define_camera` noted."""
+        noted = self._prim.GetCustomDataByKey("dsar:resolution")
+        return None if noted is None else (int(noted[0]), int(noted[1]))
+
+    def _size(self, resolution: tuple[int, int] | None) -> tuple[int, int]:
+        size = resolution or self._noted()
+        if size is None:
+            raise ExportError(
+                f"{self._where}: expected a resolution, found none in the file: give --res WIDTH HEIGHT"
+            )
+        return size
+
+    def _transform(self, matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+        """Return T_camera_world in metres, Y up, of a local-to-world matrix for row vectors."""
+        stage = self._prim.GetStage()
+        axes, center = matrix[:3, :3].T, matrix[3, :3] * UsdGeom.GetStageMetersPerUnit(stage)
+        scale = np.cbrt(np.linalg.det(axes))
+        off = np.abs(axes.T @ axes / max(scale * scale, 1e-30) - np.eye(3)).max()
+        if not (scale > 0 and off <= _RIGID_TOLERANCE):
+            lengths = ", ".join(f"{length:g}" for length in np.linalg.norm(axes, axis=0))
+            raise ExportError(
+                f"{self._where}: expected it turned, moved and scaled alike in all directions, found it "
+                f"mirrored, stretched or sheared (lengths of its axes {lengths}; determinant "
+                f"{scale**3:g}): take the scale off the camera and its parents"
+            )
+        # The camera's scale changes nothing of what it sees.
+        rotation = nearest_rotation(torch.from_numpy(axes / scale)).numpy()
+        if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z:
+            rotation, center = _Y_UP_FROM_Z_UP @ rotation, _Y_UP_FROM_Z_UP @ center
+        rotation = (rotation * [1.0, -1.0, -1.0]).T
+        result = np.eye(4)
+        result[:3, :3], result[:3, 3] = rotation, -rotation @ center
+        return result
+
+
+def _open(path: Path) -> Usd.Stage:
+    if not path.is_file():
+        raise ExportError(f"{path}: expected a USD file with cameras, found none: give its path")
+    try:
+        # With payloads: our own assets keep the cameras that move in one.
+        return Usd.Stage.Open(str(path))
+    except Tf.ErrorException as error:
+        reasons = [each.commentary.strip() for each in error.args if hasattr(each, "commentary")]
+        raise ExportError(
+            f"{path}: expected a USD file, found one that USD cannot open: {(reasons or [str(error)])[0]}: "
+            "export it again"
+        ) from error
+
+
+def _mend_types(stage: Usd.Stage) -> None:
+    """Make cameras, in memory, of those that Blender calls transforms.
+
+    With "Merge parent Xform", Blender 4.5 defines a camera that moves again as an Xform, after its lens.
+    """
+    mistaken = [
+        prim
+        for prim in stage.Traverse()
+        if prim.GetTypeName() == "Xform" and prim.HasAttribute(UsdGeom.Tokens.horizontalAperture)
+    ]
+    with Usd.EditContext(stage, stage.GetSessionLayer()):
+        for prim in mistaken:
+            prim.SetTypeName("Camera")
+
+
+def _rate(stage: Usd.Stage) -> float | None:
+    """Return the time codes per second, if the stage says how many."""
+    said = any(stage.HasAuthoredMetadata(f"{unit}PerSecond") for unit in ("timeCodes", "frames"))
+    return stage.GetTimeCodesPerSecond() if said else None
+
+
+def _constant(states: Float[np.ndarray, "t 21"]) -> bool:
+    # Between equal samples interpolation may round.
+    return np.allclose(states, states[0], rtol=1e-9, atol=1e-12)
+
+
+def _with_ancestors(prim: Usd.Prim) -> list[Usd.Prim]:
+    chain = [prim]
+    while (parent := chain[-1].GetParent()) and not parent.IsPseudoRoot():
+        chain.append(parent)
+    return chain
+
+
+def _names(prims: Sequence[Usd.Prim]) -> list[str]:
+    """Return names that differ and are identifiers: of the objects, led by parents' where those are equal."""
+    chains = [[each.GetName() for each in _with_ancestors(_object(prim))] for prim in prims]
+    lengths = [1] * len(prims)
+    while True:
+        names = [
+            _identifier("_".join(reversed(chain[:length])))
+            for chain, length in zip(chains, lengths, strict=True)
+        ]
+        longer = [
+            length + (names.count(name) > 1 and length < len(chain))
+            for name, chain, length in zip(names, chains, lengths, strict=True)
+        ]
+        if longer == lengths:
+            return _told_apart(names)
+        lengths = longer
+
+
+def _told_apart(names: Sequence[str]) -> list[str]:
+    """Return names with numbers where whole paths are one identifier, such as those of two shapes."""
+    result: list[str] = []
+    for name in names:
+        number, free = 1, name
+        while free in result:
+            number += 1
+            free = f"{name}_{number}"
+        result.append(free)
+    return result
+
+
+def _object(prim: Usd.Prim) -> Usd.Prim:
+    """Return the prim whose name the camera's author knows.
+
+    Blender and Maya write an object's transform and its data as two prims; then the data has no transform of
+    its own, and its name is one that nobody chose.
+    """
+    parent = prim.GetParent()
+    if not parent.IsA(UsdGeom.Xform) or UsdGeom.Xformable(prim).GetXformOpOrderAttr().HasAuthoredValue():
+        return prim
+    cameras = [child for child in parent.GetChildren() if child.IsA(UsdGeom.Camera)]
+    moved = UsdGeom.Xformable(parent).GetXformOpOrderAttr().HasAuthoredValue()
+    return parent if len(cameras) == 1 and (moved or parent.HasAttribute(_OBJECT_NAME)) else prim
+
+
+def _identifier(name: str) -> str:
+    plain = re.sub(r"[^A-Za-z0-9_]", "_", name)
+    return f"cam_{plain}" if plain[0].isdigit() else plain

@@ -1,0 +1,217 @@
+"""Pictures: what one camera sees of one frame while its shutter is open."""
+
+import dataclasses
+import hashlib
+import importlib.metadata
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from dsar.color import linear_from_srgb, srgb_from_linear
+from dsar.errors import ConfigError
+from dsar.geometry.paths import CameraPath
+from dsar.raster import Output, rasterize
+from dsar.types import Camera, Picture, RenderOutput
+from dsar_render.aovs import AOVS, DRAWN, Moment, cover, make_aovs
+from dsar_render.deep import sample_deep
+from dsar_render.instants import Instant
+from dsar_render.labels import Labels
+
+_MIN_ALPHA = 1e-6
+"""Below this coverage a colour has no digits left."""
+
+
+@dataclass(frozen=True)
+class RenderSettings:
+    """What a picture is made of, besides the frame and the camera."""
+
+    aovs: tuple[str, ...] = ("rgba", "Z")
+    """Output variables, some of `AOVS`, in the order in which they are listed."""
+    deep: bool = False
+    """Whether samples at their depths are wanted, too."""
+    deep_max_samples: int = 32
+    """Samples a pixel at most."""
+    motion_samples: int = 1
+    """Images that are averaged over the shutter's time."""
+    shutter: tuple[float, float] = (0.0, 0.0)
+    """When it opens and closes, in frames from the frame's own time, within -1 to 1."""
+    overscan: int = 0
+    """Pixels beyond each side of the image."""
+
+    def __post_init__(self) -> None:
+        """Check the settings against each other."""
+        opens, closes = self.shutter
+        unknown = [name for name in self.aovs if name not in AOVS]
+        if unknown or not self.aovs:
+            raise ConfigError(
+                f"--aov: expected some of {', '.join(AOVS)}, found {', '.join(unknown) or 'none'}"
+            )
+        if not -1 <= opens <= closes <= 1:
+            raise ConfigError(
+                "--shutter: expected opening and closing times from -1 to 1 frames, found "
+                f"{opens:g} {closes:g}"
+            )
+        if self.motion_samples < 1 or self.deep_max_samples < 1 or self.overscan < 0:
+            raise ConfigError(
+                "--motion-samples and --deep-max-samples start at 1, --overscan at 0; found "
+                f"{self.motion_samples}, {self.deep_max_samples} and {self.overscan}"
+            )
+        if self.motion_samples > 1 and opens == closes:
+            raise ConfigError(
+                f"--motion-samples {self.motion_samples}: the shutter is never open; give it a time, such as "
+                "--shutter -0.25 0.25"
+            )
+        if self.deep and self.motion_samples > 1:
+            raise ConfigError(
+                "--deep: a sample has one depth, and an open shutter would blur it; "
+                "leave --motion-samples out"
+            )
+        if self.deep and any(self.times):
+            raise ConfigError(
+                f"--deep: samples are of the frame's own time, and --shutter {opens:g} {closes:g} takes the "
+                f"image at {self.times[0]:g}; leave --shutter out"
+            )
+
+    @property
+    def times(self) -> list[float]:
+        """When the averaged images are taken, in frames from the frame's own time."""
+        opens, closes = self.shutter
+        step = (closes - opens) / self.motion_samples
+        return [opens + (index + 0.5) * step for index in range(self.motion_samples)]
+
+    @property
+    def needs_neighbours(self) -> bool:
+        """Whether the frames before and after are needed."""
+        return "motion" in self.aovs or any(self.times)
+
+
+def take_picture(
+    instant: Instant,
+    path: CameraPath,
+    settings: RenderSettings,
+    *,
+    labels: Labels | None = None,
+    fps: float = 24.0,
+    provenance: Mapping[str, str] | None = None,
+) -> Picture:
+    """Return the picture that a camera takes of a frame.
+
+    Everything but colour, alpha and coverage is that of the frame itself, sharp, whatever the shutter does.
+
+    Args:
+        instant: The frame; with its neighbours if `settings.needs_neighbours`.
+        path: The camera.
+        settings: What is wanted.
+        labels: Parts of the Gaussians; for `crypto`.
+        fps: Frames per second.
+        provenance: Written into files of the picture.
+    """
+    view = path.at(instant.frame)
+    now = Moment(instant.now, _widened(view, settings.overscan))
+    wanted = set(settings.aovs)
+    drawn: list[Output] = [output for name, output in DRAWN.items() if name in wanted]
+    if settings.deep:
+        drawn.append("contributors")
+    deep = None
+    with torch.no_grad():
+        output = rasterize(now.gaussians, now.camera, outputs=drawn)
+        before, after = (_moment(instant, path, step, settings.overscan) for step in (-1, 1))
+        aovs = make_aovs(wanted, output, now, before, after, labels)
+        if settings.deep:
+            most = settings.deep_max_samples
+            deep = sample_deep(output, now.gaussians, now.camera, max_samples=most)
+        if settings.times != [0.0]:
+            moments = [_shifted(instant, path, time, settings.overscan) for time in settings.times]
+            output, coverage = _exposed(output, moments, labels if "crypto" in wanted else None)
+            aovs = dataclasses.replace(aovs, coverage=coverage)
+    return Picture(
+        frame=instant.frame,
+        camera=view,
+        output=dataclasses.replace(output, contributors=None),
+        aovs=aovs,
+        deep=deep,
+        overscan=settings.overscan,
+        shutter=settings.shutter,
+        fps=fps,
+        provenance=provenance or {},
+    )
+
+
+def identify(
+    frame: int, path: CameraPath, settings: RenderSettings, provenance: Mapping[str, str], writer: str
+) -> str:
+    """Return a hash of all that a picture's file depends on: equal where the bytes are equal.
+
+    Args:
+        frame: Frame number.
+        path: The camera.
+        settings: What is rendered.
+        provenance: Where the Gaussians come from, to the checkpoint's and the motion's own hashes.
+        writer: What the file's writer was told.
+    """
+    views = [path.at(frame + step) for step in (-1, 0, 1)]
+    facts = {
+        "frame": frame,
+        "cameras": [[v.name, v.width, v.height, v.K.tolist(), v.T_camera_world.tolist()] for v in views],
+        "settings": repr(settings),
+        "provenance": dict(sorted(provenance.items())),
+        "writer": writer,
+        "version": _version(),
+    }
+    return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:32]
+
+
+@cache
+def _version() -> str:
+    return importlib.metadata.version("dsar-avatar")
+
+
+def _widened(camera: Camera, overscan: int) -> Camera:
+    """Return the camera with an image that is larger on all sides."""
+    size = camera.width + 2 * overscan, camera.height + 2 * overscan
+    return camera.cropped(-overscan, -overscan, *size) if overscan else camera
+
+
+def _moment(instant: Instant, path: CameraPath, step: int, overscan: int) -> Moment | None:
+    """Return the frame before or after, None where there is none."""
+    gaussians = instant.after if step > 0 else instant.before
+    if gaussians is None:
+        return None
+    return Moment(gaussians, _widened(path.at(instant.frame + step), overscan))
+
+
+def _shifted(instant: Instant, path: CameraPath, time: float, overscan: int) -> Moment:
+    """Return a time within the frame."""
+    return Moment(instant.at(time), _widened(path.at(instant.frame + time), overscan))
+
+
+def _exposed(
+    sharp: RenderOutput, moments: list[Moment], labels: Labels | None
+) -> tuple[RenderOutput, dict[str, torch.Tensor]]:
+    """Return the image with the mean light and coverage of some moments, and the mean coverage of parts."""
+    light, alpha = np.zeros(sharp.color.shape, np.float32), torch.zeros_like(sharp.alpha)
+    coverage: dict[str, torch.Tensor] = {}
+    for moment in moments:
+        found = rasterize(moment.gaussians, moment.camera)
+        share = 1 / len(moments)
+        light += _light(found) * np.float32(share)
+        alpha += found.alpha * share
+        if labels is not None:
+            parts = cover(moment, labels)
+            coverage = {name: coverage.get(name, 0) + part * share for name, part in parts.items()}
+    covered = alpha[..., None].numpy()
+    straight = np.divide(light, covered, out=np.zeros_like(light), where=covered > _MIN_ALPHA)
+    color = torch.from_numpy(srgb_from_linear(straight) * covered)
+    return dataclasses.replace(sharp, color=color, alpha=alpha), coverage
+
+
+def _light(output: RenderOutput) -> Float[np.ndarray, "h w 3"]:
+    """Return the linear light of an image, premultiplied: what a film's exposure adds up."""
+    covered, color = output.alpha[..., None].numpy(), output.color.numpy()
+    straight = np.divide(color, covered, out=np.zeros_like(color), where=covered > _MIN_ALPHA)
+    return linear_from_srgb(straight) * covered

@@ -1,0 +1,154 @@
+"""A shot: every frame of a rollout, from all cameras, into files; here, in processes, or on a cluster.
+
+The rollout runs once, in the calling process, because a frame follows from the one before. A frame's pictures
+depend on nothing but its Gaussians and those of the frames beside it, so they are made anywhere, and are the
+same wherever they are made.
+"""
+
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import UInt8
+
+from dsar.errors import ConfigError
+from dsar.geometry.paths import CameraPath
+from dsar.types import Camera, GaussianSequence, Picture
+from dsar_render.farm import run_tasks
+from dsar_render.images import delivered, display_image, over
+from dsar_render.instants import Instant, iterate_instants
+from dsar_render.labels import Labels, labels_of
+from dsar_render.picture import RenderSettings, identify, take_picture
+
+Image = UInt8[np.ndarray, "h w 3"]
+
+
+@runtime_checkable
+class PictureWriter(Protocol):
+    """A format, and where its files go."""
+
+    @property
+    def key(self) -> str:
+        """All settings that files depend on, besides their place."""
+        ...
+
+    def check(self, cameras: Sequence[Camera]) -> None:
+        """Raise a DsarError where cameras cannot be written together."""
+        ...
+
+    def write(self, pictures: Sequence[Picture], jobs: Sequence[str]) -> Any:
+        """Write a frame's pictures; `jobs` are hashes of all that their files depend on."""
+        ...
+
+    def complete(self, frame: int, cameras: Sequence[str], jobs: Sequence[str], deep: bool) -> bool:
+        """Return whether a frame's files are there, whole, and from these very jobs."""
+        ...
+
+
+@dataclass(frozen=True)
+class Shot:
+    """What is made of every frame."""
+
+    paths: tuple[CameraPath, ...]
+    """The cameras."""
+    writers: tuple[PictureWriter, ...]
+    """What the pictures become."""
+    settings: RenderSettings = field(default_factory=RenderSettings)
+    previews: bool = False
+    """Whether frames are also wanted as images to look at, over white."""
+
+    def __post_init__(self) -> None:
+        """Check that there are cameras, each with a name of its own."""
+        names = [path.name for path in self.paths]
+        if not names:
+            raise ConfigError("render: expected at least one camera, found none: name one or pass all")
+        if doubled := {name for name in names if names.count(name) > 1}:
+            raise ConfigError(
+                f"render: expected distinct camera names, found {sorted(doubled)} twice: rename one"
+            )
+
+    def jobs(self, frame: int, provenance: dict[str, str], writer: PictureWriter) -> list[str]:
+        """Return the hash of each camera's file of a frame."""
+        return [identify(frame, path, self.settings, provenance, writer.key) for path in self.paths]
+
+    def complete(self, frame: int, provenance: dict[str, str]) -> bool:
+        """Return whether all files of a frame are there, whole, and from this very shot."""
+        names = [path.name for path in self.paths]
+        return all(
+            writer.complete(frame, names, self.jobs(frame, provenance, writer), self.settings.deep)
+            for writer in self.writers
+        )
+
+
+def render_shot(
+    shot: Shot,
+    sequence: GaussianSequence,
+    frames: Collection[int],
+    *,
+    jobs: int = 1,
+    scheduler: str | None = None,
+) -> Iterator[tuple[int, Image | None]]:
+    """Render frames and write their files; yield each frame's number when it is done, in order.
+
+    With the number comes, if the shot has previews, an image of all cameras side by side.
+
+    Args:
+        shot: What is made of each.
+        sequence: The rollout, with the frames beside those wanted if `shot.settings.needs_neighbours`.
+        frames: Which to render.
+        jobs: Processes that draw and write; 1: this one, beside its rollout.
+        scheduler: Address of a Dask cluster that draws and writes instead, `tcp://HOST:PORT`.
+
+    Raises:
+        ConfigError: The sequence knows no body, and mattes of its parts are wanted; or the scheduler does not
+            answer.
+        RenderError: Workers died again and again.
+    """
+    labels = labels_of(sequence) if "crypto" in shot.settings.aovs else None
+    facts = labels, sequence.fps, dict(sequence.provenance)
+    work = _Work(shot.writers, shot.settings, shot.previews, *facts)
+    tasks = (
+        _Task(instant, tuple(path.around(instant.frame) for path in shot.paths))
+        for instant in iterate_instants(sequence, frames)
+    )
+    return run_tasks(work, tasks, jobs=jobs, scheduler=scheduler)
+
+
+@dataclass(frozen=True)
+class _Task:
+    """A frame to draw."""
+
+    instant: Instant
+    paths: tuple[CameraPath, ...]
+
+
+@dataclass(frozen=True)
+class _Work:
+    """Draws and writes a frame; the same for every task."""
+
+    writers: tuple[PictureWriter, ...]
+    settings: RenderSettings
+    previews: bool
+    labels: Labels | None
+    fps: float
+    provenance: dict[str, str]
+
+    def __call__(self, task: _Task) -> tuple[int, Image | None]:
+        """Return the frame's number, and its preview."""
+        pictures = [
+            take_picture(
+                *(task.instant, path, self.settings),
+                labels=self.labels,
+                fps=self.fps,
+                provenance=self.provenance,
+            )
+            for path in task.paths
+        ]
+        frame = task.instant.frame
+        shot = Shot(task.paths, self.writers, self.settings)
+        for writer in self.writers:
+            writer.write(pictures, shot.jobs(frame, self.provenance, writer))
+        if not self.previews:
+            return frame, None
+        return frame, np.concatenate([display_image(over(delivered(each), 1.0)) for each in pictures], 1)
