@@ -160,9 +160,11 @@ def test_an_error_in_one_job_comes_out_as_it_is():
 
 
 def test_an_iterator_that_is_closed_or_interrupted_finishes_what_is_in_hand():
-    done, drawn = [], []
+    done, drawn, begun = [], [], threading.Event()
 
     def work(number):
+        if number == 100:
+            begun.set()
         time.sleep(0.1)
         done.append(number)
 
@@ -179,6 +181,8 @@ def test_an_iterator_that_is_closed_or_interrupted_finishes_what_is_in_hand():
 
     def interrupted():
         yield 100
+        # Not begun, it would be cancelled.
+        assert begun.wait(10)
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
