@@ -81,7 +81,8 @@ def run_plain(
     )
     labels = labels_of(sequence)
     ends = []
-    for instant in iterate_instants(sequence, list(sequence.frame_numbers)):
+    frames, neighbours = list(sequence.frame_numbers), shot.settings.needs_neighbours
+    for instant in iterate_instants(sequence, frames, neighbours=neighbours):
         for path in shot.paths:
             picture = take_picture(instant, path, shot.settings, labels=labels, fps=sequence.fps)
             shot.writers[0].write([picture], [""])

@@ -4,6 +4,7 @@ The conversion happens once, after blending, on colours freed of their alpha; co
 premultiplied value instead would darken every soft edge.
 """
 
+import hashlib
 import os
 from dataclasses import dataclass
 from functools import lru_cache
@@ -43,6 +44,14 @@ class ColorTarget:
     def __post_init__(self) -> None:
         """Look the colour space up, so that a wrong name is found before any work."""
         _ = self.interop_id
+
+    @property
+    def key(self) -> str:
+        """All that colours depend on: of a configuration's file its contents, not those of files it names."""
+        file = Path(self.config)
+        # Machines mount folders where they like.
+        config = hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else self.config
+        return repr((self.colorspace, config))
 
     @property
     def interop_id(self) -> str:

@@ -2,10 +2,12 @@
 
 The tasks are made in the caller's thread, because a rollout runs forward only. To other processes a task and
 its result travel as bytes: torch would pass tensors through shared memory, of which a farm's containers have
-little, and which goes when the process that made it is killed.
+little, and which goes when the process that made it is killed. The bytes are NumPy's: torch packs every
+tensor as an archive of its own, of which a frame and its cameras have dozens.
 """
 
 import importlib
+import io
 import logging
 import os
 import pickle
@@ -308,9 +310,9 @@ def _in_order(hire: Callable[[], _Pool], work: Callable[[T], R], tasks: Iterable
     crew = _Crew(hire)
     try:
         apart = crew.pool.apart
-        does = partial(_work_apart, pickle.dumps(work)) if apart else work
+        does = partial(_work_apart, _packed(work)) if apart else work
         for task in tasks:
-            crew.give(partial(does, pickle.dumps(task) if apart else task))
+            crew.give(partial(does, _packed(task) if apart else task))
             del task  # or its frame would be held while the next one is made
             yield from _opened(crew.results(), apart)
             while crew.is_full():
@@ -336,11 +338,26 @@ def _work_apart(packed_work: bytes, packed_task: bytes) -> bytes:
     _use_one_thread()
     try:
         work, task = pickle.loads(packed_work), pickle.loads(packed_task)
-        return pickle.dumps(work(task))
+        return _packed(work(task))
     except Exception as error:
         if _survives_pickling(error):
             raise
         raise RenderError(f"{type(error).__name__}: {error}") from error
+
+
+class _Pickler(pickle.Pickler):
+    """Packs a tensor in main memory as the array that it is."""
+
+    def reducer_override(self, obj: Any) -> Any:
+        if type(obj) is torch.Tensor and obj.device.type == "cpu" and not obj.requires_grad:
+            return torch.from_numpy, (obj.numpy(),)
+        return NotImplemented
+
+
+def _packed(value: object) -> bytes:
+    buffer = io.BytesIO()
+    _Pickler(buffer, pickle.HIGHEST_PROTOCOL).dump(value)
+    return buffer.getvalue()
 
 
 def _survives_pickling(error: Exception) -> bool:

@@ -43,6 +43,11 @@ class PngSequence:
         """All settings that files depend on, besides their place."""
         return self.name
 
+    @property
+    def together(self) -> bool:
+        """Whether all cameras of a frame go into one file."""
+        return False
+
     def check(self, cameras: Sequence[Camera]) -> None:
         """Accept any cameras."""
 

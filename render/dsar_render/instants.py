@@ -36,11 +36,16 @@ def with_neighbours(frames: Sequence[int], first: int, last: int) -> list[int]:
     return sorted(frame for frame in every if first <= frame <= last)
 
 
-def iterate_instants(sequence: GaussianSequence, frames: Collection[int]) -> Iterator[Instant]:
+def iterate_instants(
+    sequence: GaussianSequence, frames: Collection[int], *, neighbours: bool = True
+) -> Iterator[Instant]:
     """Yield the wanted frames, each with those of the sequence that come right before and after it.
 
-    A frame is yielded when the one after it has been made.
+    A frame is yielded when the one after it has been made; without neighbours, when it has been made itself.
     """
+    if not neighbours:
+        yield from (Instant(number, each.detach()) for number, each in sequence if number in frames)
+        return
     kept: list[tuple[int, Gaussians]] = []
     for number, gaussians in sequence:
         kept = [*kept[-2:], (number, gaussians.detach())]

@@ -51,7 +51,7 @@ def label_parts(binding: Binding) -> tuple[tuple[str, ...], Int[Tensor, " n"]]:
     most: `head`, `torso`, `left_arm`, `right_hand`, ...
     """
     parts = [_part_of(joint) for joint in binding.joint_names]
-    names = (*sorted(set(parts)), GARMENT)
+    names = (*sorted({*parts} - {GARMENT}), GARMENT)
     by_joint = torch.tensor([names.index(part) for part in parts])
     labels = by_joint[binding.weights.argmax(-1)]
     # Charts of garments lie below the body's, at v < 0.

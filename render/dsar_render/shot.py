@@ -33,12 +33,17 @@ class PictureWriter(Protocol):
         """All settings that files depend on, besides their place."""
         ...
 
+    @property
+    def together(self) -> bool:
+        """Whether all cameras of a frame go into one file."""
+        ...
+
     def check(self, cameras: Sequence[Camera]) -> None:
         """Raise a DsarError where cameras cannot be written together."""
         ...
 
     def write(self, pictures: Sequence[Picture], jobs: Sequence[str]) -> Any:
-        """Write a frame's pictures; `jobs` are hashes of all that their files depend on."""
+        """Write a frame's pictures, all of them if `together`; `jobs` say what their files depend on."""
         ...
 
     def complete(self, frame: int, cameras: Sequence[str], jobs: Sequence[str], deep: bool) -> bool:
@@ -70,7 +75,8 @@ class Shot:
 
     def jobs(self, frame: int, provenance: dict[str, str], writer: PictureWriter) -> list[str]:
         """Return the hash of each camera's file of a frame."""
-        return [identify(frame, path, self.settings, provenance, writer.key) for path in self.paths]
+        key = writer.key
+        return [identify(frame, path, self.settings, provenance, key) for path in self.paths]
 
     def complete(self, frame: int, provenance: dict[str, str]) -> bool:
         """Return whether all files of a frame are there, whole, and from this very shot."""
@@ -108,10 +114,8 @@ def render_shot(
     labels = labels_of(sequence) if "crypto" in shot.settings.aovs else None
     facts = labels, sequence.fps, dict(sequence.provenance)
     work = _Work(shot.writers, shot.settings, shot.previews, *facts)
-    tasks = (
-        _Task(instant, tuple(path.around(instant.frame) for path in shot.paths))
-        for instant in iterate_instants(sequence, frames)
-    )
+    instants = iterate_instants(sequence, frames, neighbours=shot.settings.needs_neighbours)
+    tasks = (_Task(instant, tuple(path.around(instant.frame) for path in shot.paths)) for instant in instants)
     return run_tasks(work, tasks, jobs=jobs, scheduler=scheduler)
 
 
@@ -136,19 +140,23 @@ class _Work:
 
     def __call__(self, task: _Task) -> tuple[int, Image | None]:
         """Return the frame's number, and its preview."""
+        views = [view for paths in self._batches(task.paths) for view in self._shoot(task.instant, paths)]
+        return task.instant.frame, np.concatenate(views, 1) if views else None
+
+    def _batches(self, paths: tuple[CameraPath, ...]) -> list[tuple[CameraPath, ...]]:
+        """Return which cameras' pictures are in memory at a time: one, unless they share a file."""
+        return [paths] if any(writer.together for writer in self.writers) else [(path,) for path in paths]
+
+    def _shoot(self, instant: Instant, paths: tuple[CameraPath, ...]) -> list[Image]:
+        """Write what some cameras see, and return their previews, if these are wanted."""
+        labels, fps, provenance = self.labels, self.fps, self.provenance
         pictures = [
-            take_picture(
-                *(task.instant, path, self.settings),
-                labels=self.labels,
-                fps=self.fps,
-                provenance=self.provenance,
-            )
-            for path in task.paths
+            take_picture(instant, path, self.settings, labels=labels, fps=fps, provenance=provenance)
+            for path in paths
         ]
-        frame = task.instant.frame
-        shot = Shot(task.paths, self.writers, self.settings)
+        shot = Shot(paths, self.writers, self.settings)
         for writer in self.writers:
-            writer.write(pictures, shot.jobs(frame, self.provenance, writer))
+            writer.write(pictures, shot.jobs(instant.frame, provenance, writer))
         if not self.previews:
-            return frame, None
-        return frame, np.concatenate([display_image(over(delivered(each), 1.0)) for each in pictures], 1)
+            return []
+        return [display_image(over(delivered(each), 1.0)) for each in pictures]

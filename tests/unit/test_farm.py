@@ -1,5 +1,6 @@
 import logging
 import os
+import pickle
 import re
 import signal
 import subprocess
@@ -107,6 +108,28 @@ def test_a_worker_that_dies_on_a_cluster_costs_no_result(cluster, tmp_path):
     found = list(run_tasks(farm_work.measure_or_die, farm_work.tasks(tmp_path, 6), scheduler=cluster))
     assert (tmp_path / "killed").exists()
     assert found == [(number, 3.0 * number, 1, 1) for number in range(6)]
+
+
+@pytest.mark.parametrize(
+    "tensor",
+    [
+        torch.arange(6.0).view(2, 3).T,
+        torch.ones(1).expand(4),
+        torch.arange(5),
+        torch.empty(0, 3),
+        torch.tensor(2.5, dtype=torch.float64),
+        torch.ones(3, requires_grad=True),
+        torch.nn.Parameter(torch.ones(2)),
+    ],
+    ids=["transposed", "expanded", "integers", "empty", "scalar", "with gradient", "parameter"],
+)
+def test_tensors_travel_as_they_are(tensor):
+    found = pickle.loads(farm._packed({"values": tensor}))["values"]
+    assert type(found) is type(tensor)
+    same = ((each.dtype, each.shape, each.requires_grad) for each in (found, tensor))
+    assert next(same) == next(same)
+    assert torch.equal(found, tensor)
+    found.detach().add_(1)  # it is its own, and may be written to
 
 
 def test_one_job_works_beside_the_caller_on_two_tasks_at_most():

@@ -62,7 +62,10 @@ def _ragged(values: np.ndarray, pixels: np.ndarray, starts: np.ndarray, counts: 
     found = np.empty(pixels.size, object)
     # Where all are None a channel has no type.
     found[0] = values[:0]
-    for place, pixel in enumerate(pixels.ravel()):
-        if count := counts[pixel]:
-            found[place] = values[starts[pixel] : starts[pixel] + count]
+    pixels_there = pixels.ravel()
+    hit = np.flatnonzero(counts[pixels_there])
+    first = starts[pixels_there[hit]]
+    last = first + counts[pixels_there[hit]]
+    for place, start, end in zip(hit.tolist(), first.tolist(), last.tolist(), strict=True):
+        found[place] = values[start:end]
     return found.reshape(pixels.shape)

@@ -15,7 +15,7 @@ from dsar_exporters.color import ColorTarget
 from dsar_exporters.exr.channels import color_channels, crop, data_channels
 from dsar_exporters.exr.cryptomatte import matte_metadata
 from dsar_exporters.exr.deep import deep_channels
-from dsar_exporters.exr.header import Window, make_header, openexr
+from dsar_exporters.exr.header import NO_COLOR, Window, make_header, openexr
 
 Compression = Literal["none", "rle", "zips", "zip", "piz", "pxr24", "b44", "b44a", "dwaa", "dwab"]
 Views = Literal["separate", "multipart"]
@@ -54,7 +54,12 @@ class ExrSequence:
     @property
     def key(self) -> str:
         """All settings that files depend on, besides their place."""
-        return repr((self.name, self.layers, self.target, self.compression, self.views, self.crop))
+        return repr((self.name, self.layers, self.target.key, self.compression, self.views, self.crop))
+
+    @property
+    def together(self) -> bool:
+        """Whether all cameras of a frame go into one file."""
+        return self.views == "multipart"
 
     def check(self, cameras: Sequence[Camera]) -> None:
         """Check that cameras can be written together.
@@ -65,7 +70,7 @@ class ExrSequence:
         for camera in cameras:
             check_name("camera name", camera.name)
         sizes = sorted({(camera.width, camera.height) for camera in cameras})
-        if self.views == "multipart" and len(sizes) > 1:
+        if self.together and len(sizes) > 1:
             raise ExportError(
                 f"--exr-views multipart: expected cameras of one size, found {sizes}: give one with --res"
             )
@@ -78,7 +83,7 @@ class ExrSequence:
             jobs: For each the hash of all that its file depends on; see `complete`.
         """
         parts = [self.parts(picture, job) for picture, job in zip(pictures, jobs, strict=True)]
-        if self.views == "multipart":
+        if self.together:
             path = self._path(pictures[0].frame, None)
             write_parts(path, [part for each in parts for part in each])
             written = [path]
@@ -95,13 +100,14 @@ class ExrSequence:
 
     def complete(self, frame: int, cameras: Sequence[str], jobs: Sequence[str], deep: bool) -> bool:
         """Return whether a frame's files are there, whole, and from these very jobs."""
-        for camera, job in zip(cameras, jobs, strict=True):
-            files = [self._path(frame, None if self.views == "multipart" else camera)]
+        views = list(zip(cameras, jobs, strict=True))
+        files = {self._path(frame, None): views} if self.together else {}
+        for view in views:
+            if not self.together:
+                files[self._path(frame, view[0])] = [view]
             if deep:
-                files.append(self._deep_path(frame, camera))
-            if not all(_holds(file, camera, job) for file in files):
-                return False
-        return True
+                files[self._deep_path(frame, view[0])] = [view]
+        return all(_holds(path, expected) for path, expected in files.items())
 
     def _path(self, frame: int, camera: str | None) -> Path:
         if camera is None:
@@ -115,29 +121,30 @@ class ExrSequence:
         """Return the parts of a picture: one, or colour and data apart where colours lose by compression."""
         _check_size(picture)
         window, rows, columns = _window(picture, self.crop)
-        header = make_header(picture, self.target, window, job)
-        if self.views == "separate":
-            # A file of one view carries both, so that readers of either convention find it.
-            header["multiView"] = [picture.camera.name]
         matte = matte_metadata(list(picture.aovs.coverage)) if "crypto" in self.layers else {}
         color = crop(color_channels(picture, self.layers, self.target), rows, columns)
         data = crop(data_channels(picture, self.layers), rows, columns)
         name = picture.camera.name
+        # Parts of a file have to agree on it.
+        interop_id = self.target.interop_id if "rgba" in self.layers else NO_COLOR
+        header = make_header(picture, interop_id, window, job)
         if self.compression in _LOSSY and color and data:
-            header.pop("multiView", None)
             # Lossless, whatever colours get: half a pixel of motion or of an id is no small error.
             return [
                 _part(header, color, f"rgba.{name}", self.compression),
                 _part(header | matte, data, f"data.{name}", "zips"),
             ]
+        if not self.together:
+            # A file of one view carries both, so that readers of either convention find it.
+            header["multiView"] = [name]
         compression = "zips" if self.compression in _LOSSY and not color else self.compression
         # A file's only part goes without a name, which Blender would take for a layer's, and find no mattes.
-        return [_part(header | matte, color | data, name if self.views == "multipart" else "", compression)]
+        return [_part(header | matte, color | data, name if self.together else "", compression)]
 
     def _deep_part(self, picture: Picture, job: str) -> Any:
         assert picture.deep is not None
         window, rows, columns = _window(picture, self.crop)
-        header = make_header(picture, self.target, window, job)
+        header = make_header(picture, self.target.interop_id, window, job)
         color, alpha = picture.output.color.numpy(), picture.output.alpha.numpy()
         flat = self.target.premultiplied(color, alpha)
         channels = deep_channels(picture.deep, flat, self.target, rows, columns)
@@ -159,8 +166,8 @@ def write_parts(path: Path, parts: Sequence[Any]) -> None:
         openexr().File(list(parts)).write(str(draft))
 
 
-def _holds(path: Path, camera: str, job: str) -> bool:
-    """Return whether a file can be read to its end and says that it shows a camera for a job."""
+def _holds(path: Path, views: Sequence[tuple[str, str]]) -> bool:
+    """Return whether a file can be read to its end and says that it shows these cameras for these jobs."""
     if not path.is_file():
         return False
     exr = openexr()
@@ -168,7 +175,7 @@ def _holds(path: Path, camera: str, job: str) -> bool:
         with exr.File(str(path), header_only=True) as file:
             # Copies: a file empties its headers when it is closed.
             headers = [dict(part.header) for part in file.parts]
-        if not any(each.get("view") == camera and each.get("dsar/job") == job for each in headers):
+        if {(each.get("view"), each.get("dsar/job")) for each in headers} != set(views):
             return False
         with exr.File(str(path)) as file:
             # Parts that cannot be read to their end are left out.

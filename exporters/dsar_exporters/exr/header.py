@@ -1,35 +1,37 @@
 """What an EXR's header says of camera, time, colour and origin (OpenEXR's standard attributes)."""
 
 from fractions import Fraction
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float32
 
 from dsar.types import Camera, Picture
-from dsar_exporters.color import ColorTarget
 from dsar_exporters.optional import require
 
 _NTSC = Fraction(1000, 1001)
 _SENSOR_MM = 36.0
 """Width of the film back that focal lengths refer to: a pinhole camera has none of its own."""
 
+NO_COLOR = "data"
+"""The Color Interop Forum's id of what is no colour."""
 Window = tuple[int, int, int, int]
 """Left, top, right and bottom pixel, inclusive, in the display window's coordinates."""
 
 
-def make_header(picture: Picture, target: ColorTarget, window: Window, job: str) -> dict[str, Any]:
+def make_header(picture: Picture, interop_id: str, window: Window, job: str) -> dict[str, Any]:
     """Return the header of a part that shows one camera's picture.
 
     Args:
         picture: What is written.
-        target: The colour space of R, G and B.
+        interop_id: Of the colour space of R, G and B; `NO_COLOR` of a file without them.
         window: Which pixels the file holds.
         job: Hash of all that the file depends on; written as `dsar/job`.
     """
     camera = picture.camera
     left, top, right, bottom = window
-    chromaticities = openexr().colorInteropIDToChromaticities(target.interop_id)
+    chromaticities = openexr().colorInteropIDToChromaticities(interop_id)
     return {
         "displayWindow": _box(0, 0, camera.width - 1, camera.height - 1),
         "dataWindow": _box(left, top, right, bottom),
@@ -39,7 +41,7 @@ def make_header(picture: Picture, target: ColorTarget, window: Window, job: str)
         **_time(picture),
         "cameraLabel": camera.name,
         "view": camera.name,
-        "colorInteropID": target.interop_id,
+        "colorInteropID": interop_id,
         # For readers older than OpenEXR 3.4, which know nothing of the id.
         **({"chromaticities": chromaticities} if chromaticities else {}),
         "software": f"dsar {picture.provenance.get('dsar', '')}".strip(),
@@ -70,6 +72,28 @@ def world_to_ndc(camera: Camera) -> Float32[np.ndarray, "4 4"]:
     projection = np.zeros((4, 4))
     projection[:2, :3], projection[2, 2], projection[3, 2] = K[:2], 1.0, 1.0
     return _row_vector_form(projection @ camera.T_camera_world.double().numpy())
+
+
+def read_projections(path: Path) -> dict[str, Float[np.ndarray, "4 4"]]:
+    """Return how an image's header maps the world to its pixels: column vectors, pixels times w.
+
+    By `exr`, its worldToNDC, and by `exr_lens`: its worldToCamera, focal length and sensor, which say nothing
+    of the principal point, so that is worldToNDC's.
+    """
+    with openexr().File(str(path), header_only=True) as file:
+        header = file.header()
+        (left, top), (right, bottom) = (np.array(corner) for corner in header["displayWindow"])
+        to_ndc = np.array(header["worldToNDC"], np.float64).T
+        to_camera = np.array(header["worldToCamera"], np.float64).T
+        focal, sensor = float(header["pinholeFocalLength"]), np.array(header["sensorOverallDimensions"])
+    size = np.array([right - left + 1.0, bottom - top + 1.0])
+    ndc = np.diag([*size, 1.0, 1.0]) @ to_ndc
+    lens = np.zeros((4, 4))
+    # Its y is up.
+    lens[[0, 1], [0, 1]] = focal * size / sensor * [1.0, -1.0]
+    lens[:2, 2] = ndc[:2, :3] @ ndc[3, :3]
+    lens[3, 2] = 1.0
+    return {"exr": ndc, "exr_lens": lens @ to_camera}
 
 
 def openexr():

@@ -1,0 +1,58 @@
+"""Frames of the figure, and cameras that see them."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from scenes import MIDDLE
+
+from dsar.geometry.cameras import look_at
+from dsar.geometry.paths import CameraPath
+from dsar.raster import rasterize
+from dsar.types import Camera, Contributors, GaussianSequence, Picture
+from dsar_render.aovs import AOVS
+from dsar_render.instants import Instant, iterate_instants
+from dsar_render.labels import Labels, label_parts
+from dsar_render.picture import RenderSettings, take_picture
+
+
+@pytest.fixture(scope="module")
+def instants(figure: GaussianSequence) -> list[Instant]:
+    return list(iterate_instants(figure, figure.frame_numbers))
+
+
+@pytest.fixture(scope="module")
+def middle(instants: list[Instant]) -> Instant:
+    return instants[MIDDLE]
+
+
+@pytest.fixture(scope="module")
+def labels(figure: GaussianSequence) -> Labels:
+    names, of = label_parts(figure.binding)
+    return Labels(names, of.numpy().astype(np.uint8))
+
+
+@pytest.fixture(scope="module")
+def still(front: Camera) -> CameraPath:
+    return CameraPath((front,))
+
+
+@pytest.fixture(scope="module")
+def moving(front: Camera) -> CameraPath:
+    """A camera that moves, turns and zooms in over the figure's frames, keyed at two of them."""
+    K = torch.tensor([[320.0, 0.0, 95.0], [0.0, 320.0, 133.0], [0.0, 0.0, 1.0]])
+    end = look_at(np.array([-0.4, 0.5, 2.9]), np.array([0.1, -0.2, 0.0]))
+    return CameraPath((front, dataclasses.replace(front, K=K, T_camera_world=end)), (1001, 1006))
+
+
+@pytest.fixture(scope="module")
+def everything(middle: Instant, still: CameraPath, labels: Labels) -> Picture:
+    return take_picture(middle, still, RenderSettings(AOVS), labels=labels)
+
+
+@pytest.fixture(scope="module")
+def blended(middle: Instant, front: Camera) -> Contributors:
+    found = rasterize(middle.now, front, outputs=["contributors"]).contributors
+    assert found is not None
+    return found
