@@ -12,6 +12,7 @@ from typing import Annotated
 import tyro
 
 from dsar.cli.check import Check
+from dsar.cli.crosscheck import Crosscheck
 from dsar.cli.export import Export
 from dsar.cli.measure import Eval, Stress
 from dsar.cli.render import Render
@@ -20,7 +21,7 @@ from dsar.config import PRESETS
 from dsar.errors import DsarError, RenderError
 
 
-def parse(arguments: Sequence[str]) -> Train | Check | Export | Render | Eval | Stress:
+def parse(arguments: Sequence[str]) -> Train | Check | Export | Render | Eval | Stress | Crosscheck:
     """Return the command that the arguments ask for; the preset decides the other defaults."""
     preset = "demo"
     for flag, value in itertools.pairwise(arguments):
@@ -35,6 +36,7 @@ def parse(arguments: Sequence[str]) -> Train | Check | Export | Render | Eval | 
         | Annotated[Render, tyro.conf.subcommand("render")]
         | Annotated[Eval, tyro.conf.subcommand("eval")]
         | Annotated[Stress, tyro.conf.subcommand("stress")]
+        | Annotated[Crosscheck, tyro.conf.subcommand("crosscheck")]
     )
     return tyro.cli(commands, args=arguments, prog="dsar", description=__doc__)  # pyright: ignore
 

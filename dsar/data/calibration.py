@@ -87,7 +87,7 @@ def opencv_camera(where: str, name: str, K: Any, R: Any, T: Any, size: tuple[int
 
 def camera_name(name: str) -> str:
     """Return a camera's name as an identifier: `0004` becomes `cam_0004`."""
-    plain = re.sub(r"\W", "_", name)
+    plain = re.sub(r"\W", "_", name, flags=re.ASCII)
     return plain if plain.isidentifier() else f"cam_{plain}"
 
 

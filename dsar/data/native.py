@@ -185,7 +185,7 @@ def _get(record: Mapping[str, Any], key: str, kind: type[T] | tuple[type[T], ...
 
 def _read_camera(entry: Mapping[str, Any], where: str) -> Camera:
     name = _get(entry, "name", str, where)
-    if not name.isidentifier():
+    if not (name.isascii() and name.isidentifier()):
         raise CaptureError(f"{where}: expected a name of letters, digits and _, found {name!r}")
     matrices = {key: _get(entry, key, list, where) for key in ("K", "T_camera_world")}
     size = _get(entry, "width", int, where), _get(entry, "height", int, where)

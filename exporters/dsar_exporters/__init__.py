@@ -9,6 +9,7 @@ from dsar_exporters.delivery import Delivered, Output, export
 from dsar_exporters.exr import ColorTarget, ExrSequence, exr_path, ocio_config, write_exr
 from dsar_exporters.frames import parse_frames
 from dsar_exporters.inspection import find_faults
+from dsar_exporters.projections import written_projections
 from dsar_exporters.splats import (
     CompressedPlySequence,
     GltfSnapshot,
@@ -41,4 +42,5 @@ __all__ = [
     "write_exr",
     "write_ply",
     "write_usd",
+    "written_projections",
 ]

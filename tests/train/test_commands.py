@@ -272,6 +272,7 @@ def test_help_of_every_command_names_its_flags():
         ("render", "--exr"),
         ("eval", "--ablations"),
         ("stress", "--json"),
+        ("crosscheck", "--capture"),
     ):
         shown = subprocess.run(
             [sys.executable, "-m", "dsar", name, "--help"], capture_output=True, text=True, check=True

@@ -4,10 +4,13 @@ import logging
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
 
 from dsar.errors import ExportError, MissingDependencyError
 from dsar.geometry.paths import TURNTABLE, CameraPath
@@ -103,6 +106,27 @@ def read_usd_cameras(
     from dsar_exporters.usd.camera_reader import read_cameras
 
     return read_cameras(path, frames, resolution, fps)
+
+
+def read_usd_projections(
+    path: Path, sizes: Mapping[str, tuple[int, int]]
+) -> dict[str, Float[np.ndarray, "4 4"]]:
+    """Return how USD's own frustums map the world to pixels (column vectors, pixels times w), by camera.
+
+    At the stage's first time code; the world in metres, Y up, whatever the stage says that it is in.
+
+    Args:
+        path: A USD file.
+        sizes: Width and height of the pictures of the cameras that are wanted, by prim name.
+
+    Raises:
+        ExportError: A camera is not there.
+        MissingDependencyError: usd-core is not installed.
+    """
+    require("pxr.UsdGeom", feature="USD", package="usd-core>=26.3", extra="usd")
+    from dsar_exporters.usd.frustums import project_with_frustums
+
+    return project_with_frustums(path, sizes)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,120 @@
+"""`dsar crosscheck`."""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from dsar.cli.common import Common, capture_sequence
+from dsar.console import Bar
+from dsar.errors import ConfigError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from dsar.data.capture import MultiViewCapture
+    from dsar.types import Gaussians
+    from dsar_render.crosscheck import Shape
+
+
+@dataclass(frozen=True)
+class Crosscheck(Common):
+    """Prove cameras, files and images of a run, or of a capture, by another renderer: Mitsuba."""
+
+    run_folder: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(name="run")] = None
+    """Run folder; default: the newest under runs/."""
+    capture: str | None = None
+    """Check a capture alone, before training: its folder, or `embedded`."""
+    body: Path | None = None
+    """With --capture: SMPL-X model file (.npz, .pkl) or folder; default: its own, or $DSAR_BODY."""
+    frame: int = 0
+    """Frame of the test sequence whose pose is shown, from 0."""
+    variant: str | None = None
+    """Mitsuba's `llvm_ad_rgb` (needs libllvm19) or `scalar_rgb`; default: the first that works."""
+    report: Path | None = None
+    """The page; default: crosscheck.html in the run's folder, or runs/check/NAME.crosscheck.html."""
+
+    def run(self) -> None:
+        """Check, print, write the report; exit with 1 where something is wrong."""
+        from dsar_exporters import written_projections
+        from dsar_render.crosscheck import (
+            cross_check,
+            ellipsoids,
+            load_mitsuba,
+            write_crosscheck_report,
+        )
+
+        self.check_device()
+        if self.run_folder is not None and self.capture is not None:
+            raise ConfigError("dsar crosscheck: expected a run or --capture, found both: give one of them")
+        if self.body is not None and self.capture is None:
+            raise ConfigError("--body: expected with --capture; a run has its own")
+        capture, drive, page = self.open()
+        shapes = [self.posed(capture)]
+        cameras = list(capture.cameras)
+        written = written_projections(cameras)
+        mi = load_mitsuba(self.variant)
+        gaussians = drive() if drive else None
+        if gaussians is not None:
+            shapes.append(ellipsoids(gaussians))
+        with Bar(self.progress, "crosscheck").running() as bar:
+            verdict = cross_check(
+                *(mi, cameras, written, shapes, gaussians), lambda what, share: bar.show(share, what)
+            )
+        page = write_crosscheck_report(verdict, self.report or page)
+        figures = verdict.to_json()
+        self.write_json(figures | {"report": str(page)})
+        for key in ("camera_px_rms", "camera_px_max", "silhouette_iou", "depth_mae_m", "splat_psnr"):
+            sys.stdout.write(f"{key}: {figures[key]}\n")
+        for what, why in verdict.skipped.items():
+            sys.stdout.write(f"{what} not checked: {why}\n")
+        for fault in verdict.faults:
+            sys.stdout.write(f"WRONG {fault}\n")
+        sys.stdout.write(
+            f"seeded mistakes caught: {len(verdict.caught)} of {len(verdict.seeds)}; look at {page}\n"
+        )
+        if not verdict.passed:
+            raise SystemExit(1)
+
+    def open(self) -> "tuple[MultiViewCapture, Callable[[], Gaussians] | None, Path]":
+        """Return the capture, what makes a run's Gaussians of the frame, and where the page goes."""
+        from dsar.avatar import roll_out
+        from dsar.avatar.rollout import START_FRAME
+        from dsar.data.capture import capture_of, open_capture
+        from dsar.training.checkpoint import Run, load_checkpoint, newest_run
+
+        if self.capture is not None:
+            capture = open_capture(self.capture, body=self.body)
+            return capture, None, Path("runs/check") / f"{capture.name}.crosscheck.html"
+        run = Run(self.run_folder) if self.run_folder is not None else newest_run()
+        avatar, config, _ = load_checkpoint(run)
+        capture = capture_of(config)
+        motion = capture.motions[self.sequence(capture)]
+
+        def drive() -> "Gaussians":
+            _, gaussians = next(iter(roll_out(avatar, motion, frames=[START_FRAME + self.frame])))
+            return gaussians.detach()
+
+        return capture, drive, run.folder / "crosscheck.html"
+
+    def sequence(self, capture: "MultiViewCapture") -> str:
+        """Return the sequence whose pose is shown; check that it has the frame."""
+        name = next(iter(capture.motions))
+        if capture.splits.get("test"):
+            name = capture_sequence(capture, "test") or name
+        length = len(capture.motions[name])
+        if not 0 <= self.frame < length:
+            raise ConfigError(
+                f"--frame {self.frame}: expected 0 to {length - 1}, the frames of sequence {name}"
+            )
+        return name
+
+    def posed(self, capture: "MultiViewCapture") -> "Shape":
+        """Return the body in the frame's pose."""
+        from dsar.body.skinning import pose_vertices
+        from dsar_render.crosscheck import Shape
+
+        motion = capture.motions[self.sequence(capture)]
+        return Shape("body", pose_vertices(capture.body, motion[self.frame]), capture.body.faces)

@@ -1,0 +1,63 @@
+"""What our files say of cameras, as the formats' own libraries read it."""
+
+import dataclasses
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from dsar.types import Camera, Gaussians, GaussianSequence, Picture, RenderOutput
+from dsar_exporters.exr import ExrSequence
+from dsar_exporters.exr.header import read_projections
+from dsar_exporters.usd import read_usd_projections, write_usd
+
+Projections = dict[str, Float[np.ndarray, "4 4"]]
+"""By camera: world metres (homogeneous, column vectors) to pixels times w, in rows 0, 1 and 3."""
+
+_FRAME, _FPS = 1001, 24.0
+
+
+def written_projections(cameras: Sequence[Camera]) -> dict[str, Projections]:
+    """Write cameras to a USD asset and to EXR images, and return how those project, by format.
+
+    `usd`: the stage's frustums. `exr`: worldToNDC. `exr_lens`: worldToCamera and the lens.
+
+    Raises:
+        ExportError: A camera cannot be written.
+        MissingDependencyError: A format's library is not installed.
+    """
+    # Any name will do here, also one that a file of ours could not have.
+    plain = [dataclasses.replace(camera, name=f"cam_{index}") for index, camera in enumerate(cameras)]
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        stage = write_usd(_speck(), folder / "cameras.usda", name="crosscheck", cameras=plain)
+        found = {"usd": read_usd_projections(stage, {each.name: (each.width, each.height) for each in plain})}
+        for camera in plain:
+            for kind, matrix in read_projections(_write_empty(camera, folder)).items():
+                found.setdefault(kind, {})[camera.name] = matrix
+    names = {new.name: old.name for new, old in zip(plain, cameras, strict=True)}
+    return {kind: {names[key]: matrix for key, matrix in each.items()} for kind, each in found.items()}
+
+
+def _speck() -> GaussianSequence:
+    """Return one Gaussian, for an asset has to hold something."""
+    speck = Gaussians(
+        means=torch.zeros(1, 3),
+        rotations=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        scales=torch.full((1, 3), 0.01),
+        opacities=torch.ones(1),
+        harmonics=torch.zeros(1, 1, 3),
+    )
+    return GaussianSequence((_FRAME,), _FPS, 1, lambda: iter([speck]))
+
+
+def _write_empty(camera: Camera, folder: Path) -> Path:
+    """Write an image that holds one pixel, however large the camera's is."""
+    size = camera.height, camera.width
+    nothing = RenderOutput(torch.zeros(*size, 3), torch.zeros(size), torch.zeros(size), torch.tensor(0))
+    files = ExrSequence(folder, layers=("alpha",), crop=True)
+    (path,) = files.write([Picture(_FRAME, camera, nothing, fps=_FPS)], [""])
+    return path
