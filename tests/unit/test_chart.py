@@ -32,7 +32,7 @@ def test_the_front_holds_who_is_beaten_by_nobody():
 
 def test_zeroed_and_missing_rows_are_no_models():
     mean = {"fps": 50.0, "psnr_box": 21.0, "lpips": None, "gaussians": 100.0, "passed": 1.0, "minutes": 5.0}
-    row = {"label": "full", "settings": {}, "zeroed": [], "mean": mean}
+    row = {"label": "full", "settings": {}, "zeroed": [], "mean": mean, "spread": dict.fromkeys(mean)}
     rows = [row, row | {"label": "again"}, row | {"zeroed": ["state"], "settings": {"a": 1}}]
     rows.append(row | {"settings": {"b": 1}, "mean": dict.fromkeys(mean)})
     other = {"split": "test", "rows": [row | {"settings": {"c": 1}}]}
@@ -50,6 +50,8 @@ def test_zeroed_and_missing_rows_are_no_models():
         "other": other,
     }
     assert points_of(summary) == [Point("full", 20.0, 21.0, None, 100.0, 1.0)]
+    row["spread"]["psnr_box"] = 0.4
+    assert points_of(summary)[0].spread == {"psnr_box": 0.2}
     assert times_of(summary) == {"full": [(5.0, 21.0), (20.0, 22.0)]}
 
 
@@ -69,3 +71,19 @@ def test_the_picture_names_every_model(tmp_path):
         path = draw_chart(POINTS, {"quick": [(5.0, 20.0), (10.0, 20.5)]}, tmp_path / "new" / "chart.svg")
     words = {element.text for element in ElementTree.parse(path).iter() if element.text}
     assert {point.label for point in POINTS} <= words
+
+
+def test_names_stand_in_nobodys_way(tmp_path):
+    """Of a crowd not all have room; who has several seeds, or is on the front, comes first."""
+    from matplotlib import rc_context
+
+    crowd = [
+        Point(f"model {index} of a crowd", 5.0, 20.0 + index / 1e3, 0.05, 5e3, 1.0) for index in range(60)
+    ]
+    several = Point("several seeds", 5.0, 20.03, 0.06, 5e3, 1.0, {"psnr_box": 0.2, "lpips": 0.001})
+    with rc_context({"svg.fonttype": "none"}):
+        path = draw_chart([*POINTS, *crowd, several], {}, tmp_path / "chart.svg")
+    words = [element.text for element in ElementTree.parse(path).iter() if element.text]
+    assert words.count("several seeds") == 2
+    assert words.count("slow and good") == 2
+    assert 0 < sum("of a crowd" in word for word in words) < 60

@@ -1,7 +1,7 @@
 """Speed against accuracy: where each model of the study stands, and which are dominated by another."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,6 +18,11 @@ Quality = Literal["psnr_box", "lpips"]
 QUALITIES: tuple[Quality, ...] = ("psnr_box", "lpips")
 _LABELS: Mapping[Quality, str] = {"psnr_box": "PSNR, dB (ours: in the mask's box)", "lpips": "LPIPS"}
 _TIME, _SPLIT = "schedule.minutes", "fd"
+_OFFSETS = tuple((x, y) for x in (7.0, -7.0, 20.0, -20.0, 36.0, -36.0) for y in (2.0, -8.0, 12.0, -18.0))
+"""Where a name may stand beside its model, points."""
+_LEADER = {"arrowstyle": "-", "linewidth": 0.4, "color": "grey", "shrinkA": 0, "shrinkB": 0}
+_DOT = 3
+"""Half the side of the square of a model's marker that names leave free, pixels."""
 _AREA = 200
 """Points² of the marker of the model with most Gaussians."""
 
@@ -37,6 +42,8 @@ class Point:
     """How many it draws."""
     passed: float | None
     """Share of the stability battery's cases that it passes."""
+    spread: Mapping[str, float] = field(default_factory=dict)
+    """By quality: half of what its seeds part by; of models with several."""
 
 
 def points_of(summary: Mapping[str, Any]) -> list[Point]:
@@ -46,7 +53,9 @@ def points_of(summary: Mapping[str, Any]) -> list[Point]:
         mean = row["mean"]
         if _TIME not in row["settings"]:
             values = (1000 / mean["fps"], mean["psnr_box"], mean["lpips"], mean["gaussians"])
-            found.setdefault(_key(row["settings"]), Point(row["label"], *values, mean["passed"]))
+            spread = {key: row["spread"][key] / 2 for key in QUALITIES if row["spread"][key] is not None}
+            point = Point(row["label"], *values, mean["passed"], spread)
+            found.setdefault(_key(row["settings"]), point)
     return list(found.values())
 
 
@@ -87,8 +96,9 @@ def draw_chart(
 ) -> Path:
     """Draw time against PSNR and against LPIPS, and the paper's published figures on panels of their own.
 
-    Area: Gaussians. Colour: share of the stability battery that is passed. Line: the Pareto front. A fifth
-    panel shows what longer training brings.
+    Area: Gaussians. Colour: share of the stability battery that is passed. Line: the Pareto front. Bars:
+    what seeds part by. Models of several seeds and those on the front are named first, others where there is
+    room. A fifth panel shows what longer training brings.
 
     Args:
         points: The models.
@@ -102,8 +112,8 @@ def draw_chart(
         from matplotlib.figure import Figure
     except ImportError as error:
         raise MissingDependencyError("the chart", "matplotlib", "eval") from error
-    figure = Figure(figsize=(20, 9), layout="constrained")
-    panels = figure.subplots(2, 3)
+    figure = Figure(figsize=(20, 11), layout="constrained")
+    panels = figure.subplots(2, 3, height_ratios=[2, 1])
     panels[1][2].remove()
     _draw_times(panels[0][2], times)
     for column, quality in enumerate(_LABELS):
@@ -114,6 +124,10 @@ def draw_chart(
             for row in panels:
                 row[column].invert_yaxis()
             figure.colorbar(drawn, ax=panels[0][column], label="share of the stability cases passed")
+    figure.draw_without_rendering()
+    # Places in the picture are known only now.
+    for column, quality in enumerate(QUALITIES):
+        _name_models(panels[0][column], points, quality)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)
     return path
@@ -134,12 +148,35 @@ def _draw_models(axes: Any, points: Sequence[Point], quality: Quality) -> Any:
         linewidths=0.5,
     )
     for point in shown:
-        _name(axes, point.label, (point.ms, getattr(point, quality)))
+        if quality in point.spread:
+            place = point.ms, getattr(point, quality)
+            axes.errorbar(*place, point.spread[quality], color="black", linewidth=0.8, capsize=3, zorder=0)
     front = pareto_front(points, quality)
     line = [point.ms for point in front], [getattr(point, quality) for point in front]
     axes.plot(*line, "--", color="grey", linewidth=1)
     _label(axes, "milliseconds a frame, on this machine", quality)
     return drawn
+
+
+def _name_models(axes: Any, points: Sequence[Point], quality: Quality) -> None:
+    """Name models where a name finds room beside what is named already."""
+    from matplotlib.transforms import Bbox
+
+    front = pareto_front(points, quality)
+    shown = [point for point in points if getattr(point, quality) is not None]
+    dots = axes.transData.transform([(point.ms, getattr(point, quality)) for point in shown])
+    taken = [Bbox([dot - _DOT, dot + _DOT]) for dot in dots]
+    for point in sorted(shown, key=lambda p: (not p.spread, p not in front)):
+        place = point.ms, getattr(point, quality)
+        for offset in _OFFSETS:
+            name = _name(axes, point.label, place, offset)
+            box = name.get_window_extent()
+            inside = axes.bbox.x0 <= box.x0 and box.x1 <= axes.bbox.x1
+            if inside and not any(box.overlaps(other) for other in taken):
+                taken.append(box)
+                axes.annotate("", place, offset, textcoords="offset points", arrowprops=_LEADER, zorder=0)
+                break
+            name.remove()
 
 
 def _draw_times(axes: Any, times: Mapping[str, Sequence[tuple[float, float]]]) -> None:
@@ -188,11 +225,15 @@ def _draw_published(axes: Any, column: int, quality: Quality) -> None:
     axes.set_title("Published figures: another machine, another capture, the whole image", fontsize=9)
 
 
-def _name(axes: Any, label: str, place: tuple[float, float]) -> None:
-    axes.annotate(label, place, (6, 4), textcoords="offset points", fontsize=7)
+def _name(axes: Any, label: str, place: tuple[float, float], offset: tuple[float, float] = (6, 4)) -> Any:
+    side = "left" if offset[0] > 0 else "right"
+    return axes.annotate(label, place, offset, textcoords="offset points", fontsize=7, ha=side, va="center")
 
 
 def _label(axes: Any, time: str, quality: Quality) -> None:
+    from matplotlib.ticker import LogFormatter
+
     axes.set(xscale="log", xlabel=time, ylabel=_LABELS[quality])
-    axes.xaxis.set_major_formatter("{x:g}")
-    axes.xaxis.set_minor_formatter("{x:g}")
+    # Over more than a decade only some of the numbers between its powers have room.
+    for formatter in (axes.xaxis.set_major_formatter, axes.xaxis.set_minor_formatter):
+        formatter(LogFormatter(minor_thresholds=(1, 1)))
