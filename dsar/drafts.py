@@ -1,5 +1,6 @@
-"""Files that appear whole or not at all."""
+"""Files that appear whole or not at all, and what is said where the system does not take them."""
 
+import errno
 import os
 import re
 import socket
@@ -10,6 +11,65 @@ from functools import cache
 from pathlib import Path
 from shutil import rmtree
 
+from dsar.errors import DsarError, StorageError
+
+_ADVICE = {
+    "free some room there, or write elsewhere": (errno.ENOSPC, errno.EDQUOT, errno.EFBIG),
+    "write elsewhere, or change its permissions": (errno.EACCES, errno.EPERM, errno.EROFS),
+    "give another path": (errno.EISDIR, errno.ENOTDIR, errno.EEXIST, errno.ENAMETOOLONG, errno.ELOOP),
+    "check that it is there": (errno.ENOENT,),
+    "its disk or network mount failed: bring it back and run the command again": (
+        *(errno.EIO, errno.ESTALE, errno.ENODEV, errno.ENXIO, errno.ENOTCONN, errno.EHOSTDOWN),
+        *(errno.EHOSTUNREACH, errno.ENETUNREACH, errno.ETIMEDOUT, errno.EREMOTEIO),
+    ),
+}
+_ADVICE_OF_CODE = {code: advice for advice, codes in _ADVICE.items() for code in codes}
+
+
+def explain(error: OSError) -> str:
+    """Return in words what the system said, and what a person can do about it."""
+    reason = os.strerror(error.errno) if error.errno else str(error)
+    advice = _ADVICE_OF_CODE.get(error.errno or 0)
+    return f"{reason}: {advice}" if advice else reason
+
+
+@contextmanager
+def storing(path: Path) -> Iterator[None]:
+    """Name `path` in what the system says while it is written.
+
+    Libraries that have exceptions of their own quote the system's words, by which they are known.
+
+    Raises:
+        StorageError: it cannot be written.
+    """
+    try:
+        yield
+    except DsarError:
+        raise
+    except Exception as error:
+        said = error if isinstance(error, OSError) else quoted_error(str(error))
+        if said is None or not _concerns(said, path):
+            raise
+        raise StorageError(f"{path}: cannot be written: {explain(said)}") from error
+
+
+def quoted_error(text: str) -> OSError | None:
+    """Return the system's error whose words a library or another program quotes."""
+    codes = (code for code in _ADVICE_OF_CODE if os.strerror(code).lower() in text.lower())
+    return next((OSError(code, os.strerror(code)) for code in codes), None)
+
+
+def _concerns(error: OSError, path: Path) -> bool:
+    """Return whether an error is about a file that is being written: what is read has its own name."""
+    if not isinstance(error.filename, str | os.PathLike):
+        return not isinstance(error, BrokenPipeError)
+    path, other = path.absolute(), Path(os.path.abspath(error.filename))
+    if not other.is_relative_to(path.parent):
+        return other in path.parents
+    # Drafts are called after what they become.
+    first = other.relative_to(path.parent).parts[:1]
+    return not first or first[0].lstrip(".").startswith(path.name)
+
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
@@ -18,14 +78,62 @@ def replacing(path: Path) -> Iterator[Path]:
     Missing folders are made. On any exception the draft is deleted and a file already at `path` keeps its
     contents. The draft has no suffix, so that a pattern such as `*.exr` never meets it. What processes of
     this machine that were killed have left in the folder is swept away.
+
+    Raises:
+        StorageError: the system does not take it.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    _sweep(path.parent.absolute(), os.getpid())
-    prefix = f".{path.name}.{socket.gethostname()}-{os.getpid()}-"
-    with tempfile.TemporaryDirectory(prefix=prefix, dir=path.parent) as folder:
-        draft = Path(folder) / "draft"
-        yield draft
-        os.replace(draft, path)
+    with storing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        _sweep(path.parent.absolute(), os.getpid())
+        prefix = f".{path.name}.{socket.gethostname()}-{os.getpid()}-"
+        with tempfile.TemporaryDirectory(prefix=prefix, dir=path.parent) as folder:
+            draft = Path(folder) / "draft"
+            yield draft
+            os.replace(draft, path)
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a text file, UTF-8, whole or not at all; its folder is made if missing.
+
+    Raises:
+        StorageError: the system does not take it.
+    """
+    with replacing(path) as draft:
+        draft.write_text(text, encoding="utf-8")
+
+
+def check_file(path: Path) -> None:
+    """Check, before any work, that a file can be put at `path`.
+
+    Raises:
+        StorageError: a folder is there, or its own folder cannot be made or written to.
+    """
+    if path.is_dir():
+        raise StorageError(f"{path}: expected the name of a file to write, found a folder: {_OTHER}")
+    _check_parent(path, path.absolute().parent)
+
+
+def check_folder(path: Path) -> None:
+    """Check, before any work, that files can be put into a folder, which is made if missing.
+
+    Raises:
+        StorageError: a file is there, or the folder cannot be made or written to.
+    """
+    _check_parent(path, path.absolute())
+
+
+_OTHER = "give another path"
+
+
+def _check_parent(path: Path, folder: Path) -> None:
+    """Check that a folder takes files, or the nearest one above it that is there."""
+    with storing(path):
+        there = next(each for each in (folder, *folder.parents) if os.path.lexists(each))
+        if not there.is_dir():
+            what = "a file" if there.exists() else "a link that leads nowhere"
+            raise StorageError(f"{path}: expected {there} to be a folder, found {what}: {_OTHER}")
+        with tempfile.TemporaryFile(dir=there):
+            pass
 
 
 @cache

@@ -7,8 +7,10 @@ DsarError                       every message says what, where, expected, found,
 ├── BodyError        (ValueError)   a body-model file
 ├── CheckpointError  (ValueError)   a run folder or its checkpoint
 ├── ExportError      (ValueError)   something that cannot be written as asked
+├── RasterError      (ValueError)   Gaussians that cannot be drawn
+├── StorageError     (OSError)      a disk or folder that does not take or give a file
 ├── RenderError      (RuntimeError) frames could not be rendered
-├── TrainingError    (ArithmeticError) training stopped: a value is not finite
+├── TrainingError    (ArithmeticError) training stopped: a value is not finite, or a worker died
 └── MissingDependencyError (ImportError) an optional package is not installed
 """
 
@@ -45,12 +47,16 @@ class RasterError(DsarError, ValueError):
     """Gaussians cannot be drawn."""
 
 
+class StorageError(DsarError, OSError):
+    """The system does not take or give a file: no room, no permission, no folder, no disk."""
+
+
 class RenderError(DsarError, RuntimeError):
     """Frames could not be rendered: workers or a cluster failed."""
 
 
 class TrainingError(DsarError, ArithmeticError):
-    """Training met a value that is not finite."""
+    """Training met a value that is not finite, or lost a worker."""
 
 
 class MissingDependencyError(DsarError, ImportError):

@@ -1,13 +1,13 @@
 """The `dsar` command: parse, build, call. Work and file formats live in the rooms that own them."""
 
-import itertools
 import logging
+import os
 import signal
 import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Annotated
+from typing import Annotated, NoReturn
 
 import tyro
 
@@ -18,15 +18,24 @@ from dsar.cli.measure import Eval, Stress
 from dsar.cli.render import Render
 from dsar.cli.train import Train
 from dsar.config import PRESETS
-from dsar.errors import DsarError, RenderError
+from dsar.drafts import explain
+from dsar.errors import DsarError, RenderError, StorageError
+
+Command = Train | Check | Export | Render | Eval | Stress | Crosscheck
+_INTERRUPTED, _TERMINATED = 128 + signal.SIGINT, 128 + signal.SIGTERM
+_NO_READER = 128 + signal.SIGPIPE
 
 
-def parse(arguments: Sequence[str]) -> Train | Check | Export | Render | Eval | Stress | Crosscheck:
+def parse(arguments: Sequence[str]) -> Command:
     """Return the command that the arguments ask for; the preset decides the other defaults."""
-    preset = "demo"
-    for flag, value in itertools.pairwise(arguments):
-        if flag == "--preset" and value in PRESETS:
-            preset = value
+    command = _parse(arguments, "demo")
+    if isinstance(command, Train) and command.preset != "demo":
+        return _parse(arguments, command.preset)
+    return command
+
+
+def _parse(arguments: Sequence[str], preset: str) -> Command:
+    """Return the command, with a preset's values for what is not said."""
     chosen = PRESETS[preset]
     default = Train(atlas=chosen.atlas, model=chosen.model, loss=chosen.loss, schedule=chosen.schedule)
     commands = (
@@ -59,16 +68,44 @@ def _cleaning_up_when_terminated() -> Iterator[None]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run a command; a DsarError becomes one line on stderr and exit code 2."""
+    """Run a command; what goes wrong becomes one line on stderr.
+
+    Exit codes: 2 where an input, a setting or the system is at fault, 1 where a part of a batch failed, 130
+    where the command was interrupted, 143 where it was terminated.
+    """
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
     command = parse(sys.argv[1:] if arguments is None else arguments)
     try:
         with _cleaning_up_when_terminated():
-            command.run()
+            command.check_places()
+            _run(command)
     except DsarError as error:
-        sys.stderr.write(f"dsar: {error}\n")
         # What was done of a batch is there; what was asked for was right.
-        raise SystemExit(1 if isinstance(error, RenderError) else 2) from error
+        _leave(str(error), 1 if isinstance(error, RenderError) else 2, error)
+    except BrokenPipeError:
+        # Whoever read our output has seen enough; Python would complain again when it closes it.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(_NO_READER) from None
+    except OSError as error:
+        what = f"{error.filename}: " if error.filename else ""
+        _leave(what + explain(error), 2, error)
+
+
+def _run(command: Command) -> None:
+    """Run a command, and say what it leaves where it is stopped in its midst."""
+    try:
+        command.run()
+    except StorageError as error:
+        raise StorageError(f"{error}; {command.kept()}") from error
     except KeyboardInterrupt:
-        sys.stderr.write("dsar: interrupted; what was done is saved (continue with --resume)\n")
-        raise SystemExit(130) from None
+        _leave(f"interrupted; {command.kept()}", _INTERRUPTED)
+    except SystemExit as stop:
+        if stop.code == _TERMINATED:
+            _leave(f"terminated; {command.kept()}", _TERMINATED)
+        raise
+
+
+def _leave(message: str, code: int, cause: BaseException | None = None) -> NoReturn:
+    """Write one line and end with an exit code."""
+    sys.stderr.write(f"dsar: {' '.join(message.split())}\n")
+    raise SystemExit(code) from cause

@@ -12,6 +12,7 @@ from dsar.config import PRESETS
 from dsar.console import Bar
 
 _MINUTES = 60.0
+_SHEETS = Path("runs/check")
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,14 @@ class Check(Common):
     sheet: Path | None = None
     """PNG of the body over the images; default runs/check/NAME.png."""
 
+    def files(self) -> list[Path]:
+        """Return the sheet, where it has a name already."""
+        return [] if self.sheet is None else [self.sheet]
+
+    def folders(self) -> list[Path]:
+        """Return where a sheet goes that has none."""
+        return [_SHEETS] if self.sheet is None else []
+
     def run(self) -> None:
         """Check, print, write the sheet; exit with 2 where the capture cannot train."""
         from dsar.data.capture import open_capture
@@ -42,7 +51,7 @@ class Check(Common):
             verdict = check_capture(capture, lambda what, share: bar.show(share, what))
         rows, columns = draw_overlays(capture)
         sheet = write_sheet(
-            self.sheet or Path("runs/check") / f"{capture.name}.png",
+            self.sheet or _SHEETS / f"{capture.name}.png",
             rows,
             columns=columns,
         )

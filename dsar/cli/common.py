@@ -2,9 +2,12 @@
 
 import dataclasses
 import json
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
+
+import tyro
 
 from dsar.console import ProgressStyle, follow
 from dsar.errors import ConfigError
@@ -14,17 +17,44 @@ Device = Literal["auto", "cpu", "cuda"]
 
 
 @dataclass(frozen=True)
-class Common:
+class Common(ABC):
     """Flags of every command."""
 
     device: Device = "auto"
     """Where to compute."""
-    seed: int = 0
-    """Seed of everything random."""
     progress: ProgressStyle = "auto"
     """How to show progress."""
     json: Path | None = None
     """Write what the command found here, machine-readable."""
+
+    @abstractmethod
+    def run(self) -> None:
+        """Do what the command is for."""
+
+    def files(self) -> list[Path]:
+        """Return the files that the command writes, by its flags."""
+        return []
+
+    def folders(self) -> list[Path]:
+        """Return the folders into which it writes files of its own."""
+        return []
+
+    def kept(self) -> str:
+        """Return in words what is left of the work when the command is stopped."""
+        return "nothing was written"
+
+    def check_places(self) -> None:
+        """Check, before any work, that all that is to be written can be.
+
+        Raises:
+            StorageError: a place cannot be written to.
+        """
+        from dsar.drafts import check_file, check_folder
+
+        for path in [*self.files(), *([] if self.json is None else [self.json])]:
+            check_file(path)
+        for path in self.folders():
+            check_folder(path)
 
     def check_device(self) -> None:
         """Raise ConfigError where the device is not supported."""
@@ -33,10 +63,24 @@ class Common:
 
     def write_json(self, content: dict) -> None:
         """Write the --json file, if one was asked for."""
-        from dsar.training.checkpoint import write_whole
+        from dsar.drafts import write_whole
 
         if self.json is not None:
             write_whole(self.json, json.dumps(content, indent=2) + "\n")
+
+
+@dataclass(frozen=True)
+class OnRun(Common):
+    """Flags of commands that open a run."""
+
+    run_folder: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(name="run")] = None
+    """Run folder; default: the newest under runs/."""
+
+    def chosen_run(self) -> Path:
+        """Return the run folder: the one named, else the newest."""
+        from dsar.training.checkpoint import newest_run
+
+        return self.run_folder or newest_run().folder
 
 
 def shown(sequence: GaussianSequence, style: ProgressStyle, title: str) -> GaussianSequence:

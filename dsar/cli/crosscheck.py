@@ -3,11 +3,9 @@
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import tyro
-
-from dsar.cli.common import Common, capture_sequence
+from dsar.cli.common import OnRun, capture_sequence
 from dsar.console import Bar
 from dsar.errors import ConfigError
 
@@ -18,13 +16,13 @@ if TYPE_CHECKING:
     from dsar.types import Gaussians
     from dsar_render.crosscheck import Shape
 
+_PAGES = Path("runs/check")
+
 
 @dataclass(frozen=True)
-class Crosscheck(Common):
+class Crosscheck(OnRun):
     """Prove cameras, files and images of a run, or of a capture, by another renderer: Mitsuba."""
 
-    run_folder: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(name="run")] = None
-    """Run folder; default: the newest under runs/."""
     capture: str | None = None
     """Check a capture alone, before training: its folder, or `embedded`."""
     body: Path | None = None
@@ -35,6 +33,16 @@ class Crosscheck(Common):
     """Mitsuba's `llvm_ad_rgb` (needs libllvm19) or `scalar_rgb`; default: the first that works."""
     report: Path | None = None
     """The page; default: crosscheck.html in the run's folder, or runs/check/NAME.crosscheck.html."""
+
+    def files(self) -> list[Path]:
+        """Return the page, where it has a name already."""
+        return [] if self.report is None else [self.report]
+
+    def folders(self) -> list[Path]:
+        """Return where a page goes that has none."""
+        if self.report is not None:
+            return []
+        return [_PAGES if self.capture is not None else self.chosen_run()]
 
     def run(self) -> None:
         """Check, print, write the report; exit with 1 where something is wrong."""
@@ -83,12 +91,12 @@ class Crosscheck(Common):
         from dsar.avatar import roll_out
         from dsar.avatar.rollout import START_FRAME
         from dsar.data.capture import capture_of, open_capture
-        from dsar.training.checkpoint import Run, load_checkpoint, newest_run
+        from dsar.training.checkpoint import Run, load_checkpoint
 
         if self.capture is not None:
             capture = open_capture(self.capture, body=self.body)
-            return capture, None, Path("runs/check") / f"{capture.name}.crosscheck.html"
-        run = Run(self.run_folder) if self.run_folder is not None else newest_run()
+            return capture, None, _PAGES / f"{capture.name}.crosscheck.html"
+        run = Run(self.chosen_run())
         avatar, config, _ = load_checkpoint(run)
         capture = capture_of(config)
         motion = capture.motions[self.sequence(capture)]

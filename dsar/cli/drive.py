@@ -4,11 +4,9 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import tyro
-
-from dsar.cli.common import Common, capture_sequence
+from dsar.cli.common import OnRun, capture_sequence
 from dsar.types import Camera, GaussianSequence, Motion
 
 if TYPE_CHECKING:
@@ -33,11 +31,9 @@ class Performance:
 
 
 @dataclass(frozen=True)
-class Drive(Common):
+class Drive(OnRun):
     """Flags of commands that drive a trained avatar."""
 
-    run_folder: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(name="run")] = None
-    """Run folder; default: the newest under runs/."""
     motion: str = "test"
     """An AMASS/SMPL-X .npz or .bvh file, a sequence of the run's capture, or its split `test` or `train`."""
     frames: str | None = None
@@ -48,12 +44,6 @@ class Drive(Common):
         from dsar_exporters import parse_frames
 
         return None if self.frames is None else parse_frames(self.frames)
-
-    def chosen_run(self) -> Path:
-        """Return the run folder: the one named, else the newest."""
-        from dsar.training.checkpoint import newest_run
-
-        return self.run_folder or newest_run().folder
 
     def open(self) -> Performance:
         """Return the avatar and its motion."""

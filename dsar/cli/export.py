@@ -40,6 +40,18 @@ class Export(Drive):
     check: Path | None = None
     """Write nothing; say what is wrong with this file, whoever wrote it (USD, PLY or SPZ)."""
 
+    def files(self) -> list[Path]:
+        """Return the files of a name of their own."""
+        return [path for path in (self.usd, self.glb) if path is not None]
+
+    def folders(self) -> list[Path]:
+        """Return the folders of sequences."""
+        return [path for path in (self.ply, self.compressed_ply, self.spz) if path is not None]
+
+    def kept(self) -> str:
+        """Return what is left."""
+        return "no file is half written; of splat sequences the frames that were finished stay"
+
     def run(self) -> None:
         """Write every requested format from one rollout, or check a file."""
         if self.check is not None:
@@ -47,7 +59,7 @@ class Export(Drive):
             return
         from dsar_exporters import export
 
-        if not self.places():
+        if not self.files() and not self.folders():
             raise ConfigError(
                 "dsar export: nothing to write; give --usd out.usda, --ply DIR, --compressed-ply DIR, "
                 "--spz DIR, --glb FILE or --check FILE"
@@ -64,11 +76,6 @@ class Export(Drive):
             for name, each in zip(outputs, delivered, strict=True)
         }
         self.write_json({"motion": performance.motion.name, "written": written, "cost": files, **facts})
-
-    def places(self) -> list[Path]:
-        """Return where something is to be written."""
-        wanted = (self.usd, self.ply, self.compressed_ply, self.spz, self.glb)
-        return [place for place in wanted if place is not None]
 
     def outputs(self, cameras: Sequence[Camera]) -> "dict[str, Output]":
         """Return the requested formats by the name of their flag."""

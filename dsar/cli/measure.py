@@ -4,21 +4,16 @@ import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
-import tyro
-
-from dsar.cli.common import Common, capture_sequence
+from dsar.cli.common import OnRun, capture_sequence
 from dsar.cli.previews import write_worst
 from dsar.console import Bar, follow
 
 
 @dataclass(frozen=True)
-class Eval(Common):
+class Eval(OnRun):
     """Measure a run on the frames it never saw; or train and measure the models of the paper's tables."""
 
-    run_folder: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(name="run")] = None
-    """Run folder; default: the newest under runs/."""
     ablations: bool = False
     """The paper's ablations instead of a run: trained, measured, and set beside the paper's figures."""
     baselines: bool = False
@@ -34,18 +29,35 @@ class Eval(Common):
     chart: Path | None = None
     """Draw the tables' models, speed against accuracy, to this file (.svg, .png)."""
 
+    def files(self) -> list[Path]:
+        """Return the chart."""
+        return [] if self.chart is None else [self.chart]
+
+    def folders(self) -> list[Path]:
+        """Return the folder of the tables' models, or the run, which keeps its figures and report."""
+        return [self.study if self.is_study else self.chosen_run()]
+
+    def kept(self) -> str:
+        """Return what is left."""
+        return "models that were measured stay; the same command goes on" if self.is_study else super().kept()
+
+    @property
+    def is_study(self) -> bool:
+        """Whether tables are made."""
+        return self.ablations or self.baselines
+
     def run(self) -> None:
         """Measure and print the figures."""
-        if self.ablations or self.baselines:
+        if self.is_study:
             self.run_study()
         else:
             self.run_heldout()
 
     def run_study(self) -> None:
         """Train and measure what the tables lack; print them."""
+        from dsar.drafts import write_whole
         from dsar.evaluation.study import ABLATIONS, BASELINES, Study, summarize_tables, to_markdown
         from dsar.evaluation.study.chart import draw_chart, points_of, times_of
-        from dsar.training.checkpoint import write_whole
 
         self.check_device()
         every = ABLATIONS | BASELINES
@@ -68,12 +80,13 @@ class Eval(Common):
     def run_heldout(self) -> None:
         """Measure one run."""
         from dsar.data.capture import capture_of
+        from dsar.drafts import write_whole
         from dsar.evaluation.heldout import evaluate
         from dsar.evaluation.report import write_report
-        from dsar.training.checkpoint import Run, load_checkpoint, newest_run, write_whole
+        from dsar.training.checkpoint import Run, load_checkpoint
 
         self.check_device()
-        run = Run(self.run_folder) if self.run_folder else newest_run()
+        run = Run(self.chosen_run())
         avatar, config, _ = load_checkpoint(run)
         figures = evaluate(avatar, capture_of(config))
         self.write_json(figures)
@@ -90,21 +103,23 @@ class Eval(Common):
 
 
 @dataclass(frozen=True)
-class Stress(Common):
+class Stress(OnRun):
     """Drive an avatar where rollouts fail."""
 
-    run_folder: Annotated[tyro.conf.Positional[Path | None], tyro.conf.arg(name="run")] = None
-    """Run folder; default: the newest under runs/."""
+    def folders(self) -> list[Path]:
+        """Return the run, which keeps its verdicts and report."""
+        return [self.chosen_run()]
 
     def run(self) -> None:
         """Run the battery on the held-out motion that is furthest from training; print each verdict."""
         from dsar.data.capture import capture_of
+        from dsar.drafts import write_whole
         from dsar.evaluation.report import write_report
         from dsar.evaluation.stress import CASES, stress
-        from dsar.training.checkpoint import Run, load_checkpoint, newest_run, write_whole
+        from dsar.training.checkpoint import Run, load_checkpoint
 
         self.check_device()
-        run = Run(self.run_folder) if self.run_folder else newest_run()
+        run = Run(self.chosen_run())
         avatar, config, _ = load_checkpoint(run)
         capture = capture_of(config)
         verdicts = stress(avatar, capture.motions[capture_sequence(capture, "test") or ""], CASES)

@@ -74,6 +74,20 @@ class Render(Drive):
     name: str = "avatar"
     """Name in the files."""
 
+    def files(self) -> list[Path]:
+        """Return the video and the farm's job."""
+        return [path for path in (self.mp4, self.openjd) if path is not None]
+
+    def folders(self) -> list[Path]:
+        """Return the folders of image sequences; a farm's job writes none."""
+        return [path for path in (self.exr, self.png) if path is not None and self.openjd is None]
+
+    def kept(self) -> str:
+        """Return what is left."""
+        if not self.folders():
+            return "nothing was written"
+        return "the images that were finished stay; the same command with --skip-existing goes on"
+
     def run(self) -> None:
         """Render every chosen camera and write every requested format."""
         import torch
@@ -203,7 +217,7 @@ class Render(Drive):
 
     def write_template(self, path: Path, frames: Sequence[int]) -> None:
         """Write the farm's job."""
-        from dsar.training.checkpoint import write_whole
+        from dsar.drafts import write_whole
         from dsar_render import openjd_template
 
         command = ["dsar", "render", *self.arguments()]

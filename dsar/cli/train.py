@@ -40,6 +40,8 @@ class Train(Common):
     """Processes, one core each."""
     resume: bool = False
     """Go on with the run in --out."""
+    seed: int = 0
+    """Seed of everything random."""
     atlas: AtlasConfig = field(default_factory=AtlasConfig)
     """The texel grid."""
     model: ModelConfig = field(default_factory=ModelConfig)
@@ -72,6 +74,25 @@ class Train(Common):
             schedule=schedule,
         )
 
+    def folders(self) -> list[Path]:
+        """Return the run's folder."""
+        return [self.folder]
+
+    @property
+    def folder(self) -> Path:
+        """The run's folder."""
+        return self.out or Path("runs") / self.preset
+
+    def kept(self) -> str:
+        """Return up to where training is saved."""
+        from dsar.training.checkpoint import Run, read_progress
+
+        run = Run(self.folder)
+        if not run.exists:
+            return "no checkpoint was written yet"
+        step = read_progress(run)["step"]
+        return f"training is saved up to update {step} in {run.checkpoint}; --resume goes on from there"
+
     def run(self) -> None:
         """Train, then leave pictures and a report."""
         from dsar.training.checkpoint import Run, read_progress
@@ -79,15 +100,15 @@ class Train(Common):
         from dsar.training.report import Report
 
         self.check_device()
-        run = Run(self.out or Path("runs") / self.preset)
+        run = Run(self.folder)
         last: list[Report] = []
         with Bar(self.progress, "train").running() as bar:
 
             def report(line: Report) -> None:
                 last[:] = [line]
-                left = line.seconds * (1 / max(line.progress, 1e-3) - 1)
+                left = "" if line.seconds_left is None else f" {line.seconds_left:.0f} s left"
                 numbers = f"loss {line.loss:.4f} PSNR {line.psnr:.2f} dB"
-                bar.show(line.progress, f"{line.stage} step {line.step} {numbers} {left:.0f} s left")
+                bar.show(line.progress, f"{line.stage} step {line.step} {numbers}{left}")
 
             train(self.config(), run, resume=self.resume, report=report)
         sheet = write_previews(run.folder)

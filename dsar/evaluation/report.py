@@ -16,9 +16,10 @@ from jinja2 import Environment, StrictUndefined
 from plotly.offline import get_plotlyjs
 
 from dsar.config import PRESETS, TrainConfig, config_from_json, config_to_json
+from dsar.drafts import write_whole
 from dsar.evaluation.study.chart import QUALITIES, interactive_chart, points_of, times_of
 from dsar.evaluation.study.summary import table_cells
-from dsar.training.checkpoint import Run, read_progress, write_whole
+from dsar.training.checkpoint import Run, read_progress
 
 _STAGES = {"template": "#9aa5b1", "imitation": "#c77d0a", "pose": "#4c78a8", "autoregressive": "#2a7f62"}
 _METRICS = (

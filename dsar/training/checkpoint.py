@@ -90,14 +90,6 @@ class Run:
         return (self.checkpoint / "progress.json").exists()
 
 
-def write_whole(path: Path, text: str) -> None:
-    """Write a text file whole or not at all; its folder is made if missing."""
-    draft = path.with_name(path.name + ".tmp")
-    draft.parent.mkdir(parents=True, exist_ok=True)
-    draft.write_text(text)
-    os.replace(draft, path)
-
-
 def newest_run(root: Path = Path("runs")) -> Run:
     """Return the run with the newest checkpoint under `runs/`."""
     found = sorted(root.glob("*/checkpoint/progress.json"), key=lambda path: path.stat().st_mtime)

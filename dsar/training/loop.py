@@ -18,6 +18,7 @@ from dsar.avatar.stillness import stillest_frames
 from dsar.config import TrainConfig, config_from_json, config_to_json
 from dsar.data.capture import capture_of
 from dsar.data.multiview import MultiViewCapture
+from dsar.drafts import storing, write_whole
 from dsar.errors import CaptureError, CheckpointError, ConfigError, TrainingError
 from dsar.training import checkpoint as ckpt
 from dsar.training import workers
@@ -67,8 +68,7 @@ def train(config: TrainConfig, run: Run, *, resume: bool = False, report: Report
         check_same_settings(config, config_from_json(run.config), run)
     done = ckpt.read_progress(run)["progress"] if resume else 0.0
     check_budget(config, workers.here(config.workers), done, capture.kept_bytes)
-    run.folder.mkdir(parents=True, exist_ok=True)
-    run.config.write_text(config_to_json(config))
+    write_whole(run.config, config_to_json(config))
     workers.run_workers(config.workers, _train, (config, run.folder, resume), report)
     return run
 
@@ -118,7 +118,7 @@ def _train(config: TrainConfig, folder: Path, resume: bool, report: Reporter | N
         registration.carry_on(ckpt.load_registration(run.checkpoint, workers.rank()))
         trainer.registered = registration.result
     clock, used, stop = Clock(schedule.minutes), 0.0, False
-    monitor = Monitor(run.metrics, schedule.steps, report)
+    monitor = Monitor(run.metrics, schedule.steps, report, began=progress)
     with _stop_signals() as received:
         while progress < 1:
             if stop:
@@ -233,21 +233,36 @@ def save(
     step: int,
     progress: float,
 ) -> None:
-    """Write a complete checkpoint, every worker its own rollouts, and put it in place at once."""
+    """Write a complete checkpoint, every worker its own rollouts, and put it in place at once.
+
+    Raises:
+        StorageError: the system does not take it; the checkpoint before it stays.
+    """
     folder = run.folder / "checkpoint.tmp"
-    if workers.rank() == 0:
+    with storing(run.checkpoint), _removed_on_failure(folder):
+        if workers.rank() == 0:
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir()
+            ckpt.save_avatar(avatar, folder)
+            ckpt.save_optimizers(optimizers, folder)
+        workers.barrier()
+        ckpt.save_rollouts(folder, workers.rank(), *trainer.carried())
+        ckpt.save_registration(folder, workers.rank(), registration.carried())
+        workers.barrier()
+        if workers.rank() == 0:
+            ckpt.save_progress(folder, step, progress)
+            ckpt.replace_folder(folder, run.checkpoint)
+        workers.barrier()
+
+
+@contextmanager
+def _removed_on_failure(folder: Path) -> Iterator[None]:
+    """Give back the room that half a checkpoint takes."""
+    try:
+        yield
+    except BaseException:
         shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir()
-        ckpt.save_avatar(avatar, folder)
-        ckpt.save_optimizers(optimizers, folder)
-    workers.barrier()
-    ckpt.save_rollouts(folder, workers.rank(), *trainer.carried())
-    ckpt.save_registration(folder, workers.rank(), registration.carried())
-    workers.barrier()
-    if workers.rank() == 0:
-        ckpt.save_progress(folder, step, progress)
-        ckpt.replace_folder(folder, run.checkpoint)
-    workers.barrier()
+        raise
 
 
 class Clock:

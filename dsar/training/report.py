@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from dsar.drafts import storing
 from dsar.training.segment import Progress
 
 _log = logging.getLogger(__name__)
@@ -36,6 +37,8 @@ class Report:
     """Smoothed PSNR of training crops, dB."""
     seconds: float
     """Seconds since the first update of this process."""
+    seconds_left: float | None
+    """Seconds until the end at the pace of this process; None before it has one."""
     gradients: dict[str, float] | None = None
     """Each regulariser's gradient as a share of the images', when they were last compared."""
 
@@ -46,8 +49,9 @@ Reporter = Callable[[Report], None]
 class Monitor:
     """Smooths what updates report, and passes it on."""
 
-    def __init__(self, metrics: Path, steps: int, reporter: Reporter | None) -> None:
-        self._metrics, self._steps, self._reporter = metrics, steps, reporter
+    def __init__(self, metrics: Path, steps: int, reporter: Reporter | None, *, began: float = 0.0) -> None:
+        """Write to `metrics` and tell `reporter`; `began` is the progress with which this process began."""
+        self._metrics, self._steps, self._reporter, self._began = metrics, steps, reporter, began
         self._smoothed: Progress | None = None
         self._warned: set[str] = set()
 
@@ -64,7 +68,7 @@ class Monitor:
         """Append a line of smoothed values to metrics.jsonl and show it to the listener."""
         assert self._smoothed is not None
         line = self._line(step, progress, stage, seconds, self._smoothed)
-        with self._metrics.open("a") as file:
+        with storing(self._metrics), self._metrics.open("a") as file:
             file.write(json.dumps(dataclasses.asdict(line)) + "\n")
         if self._reporter is not None:
             self._reporter(line)
@@ -76,7 +80,9 @@ class Monitor:
 
     def _line(self, step: int, progress: float, stage: str, seconds: float, done: Progress) -> Report:
         psnr = -10 * math.log10(max(done.mse or 0.0, 1e-10))
-        return Report(step, self._steps, progress, stage, done.loss, psnr, seconds, done.gradients)
+        gained = progress - self._began
+        left = seconds * (1 - progress) / gained if gained > 0 else None
+        return Report(step, self._steps, progress, stage, done.loss, psnr, seconds, left, done.gradients)
 
 
 def _smooth(before: Progress | None, now: Progress) -> Progress:

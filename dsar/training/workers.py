@@ -5,19 +5,27 @@ Small tensors make intra-operation threads useless here, so every worker compute
 """
 
 import os
+import signal
+import sys
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numba
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
+from dsar.errors import DsarError, TrainingError
+
 TIMELY = 2
 """Extra numbers that travel with the gradients: a request to stop, and the share of the budget used."""
+_BACKEND = "gloo"
+_LAST_WORDS_S, _FAREWELL_S = 5.0, 30.0
+"""How long a worker that broke the group may take to say why, and one that is done to end."""
 
 
 class Gradients:
@@ -82,6 +90,9 @@ def run_workers(count: int, work: Callable[..., None], arguments: tuple[Any, ...
     """Call `work(*arguments, report)` in `count` processes joined in a group, this one being the first.
 
     Only the first worker gets `report`; the others get None in its place.
+
+    Raises:
+        DsarError: what any of them raised; without words of its own a worker that died is a TrainingError.
     """
     if "RANK" in os.environ:
         with _group("env://", int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"])):
@@ -94,22 +105,59 @@ def run_workers(count: int, work: Callable[..., None], arguments: tuple[Any, ...
     with tempfile.TemporaryDirectory() as folder:
         rendezvous = (Path(folder) / "rendezvous").as_uri()
         context = torch.multiprocessing.get_context("spawn")
+        said = context.SimpleQueue()
+        group = (rendezvous, count, work)
         others = [
-            context.Process(target=_work, args=(rendezvous, i, count, work, (*arguments, None)), daemon=True)
+            context.Process(target=_work_beside, args=(said, i, *group, (*arguments, None)), daemon=True)
             for i in range(1, count)
         ]
         for process in others:
             process.start()
+        patience_s = _FAREWELL_S
         try:
-            _work(rendezvous, 0, count, work, (*arguments, report))
+            _work(0, *group, (*arguments, report))
+        except DsarError:
+            patience_s = 0.0  # they would wait for this one
+            raise
+        except RuntimeError as error:
+            # The group breaks when one of it goes; that one knows why.
+            _raise_what_others_said(said, others, error)
         finally:
             for process in others:
-                process.join(timeout=30)
+                process.join(timeout=patience_s)
                 process.kill()
 
 
+def _raise_what_others_said(said: Any, others: Sequence[Any], error: RuntimeError) -> NoReturn:
+    """Raise what another worker said, or how one ended; else what happened here."""
+    deadline = time.monotonic() + _LAST_WORDS_S
+    while time.monotonic() < deadline and all(process.is_alive() for process in others):
+        time.sleep(0.05)
+    if not said.empty():
+        raise said.get() from error
+    codes = {number: each.exitcode for number, each in enumerate(others, 1) if each.exitcode}
+    for number, code in codes.items():
+        how = f"signal {-code}" if code < 0 else f"code {code}"
+        memory = ", probably because memory ran out: give fewer --workers" if code == -signal.SIGKILL else ""
+        raise TrainingError(f"worker {number} of {len(others) + 1} ended with {how}{memory}") from error
+    raise error
+
+
+def _work_beside(said: Any, *arguments: Any) -> None:
+    """Work in a process beside the first; what a user should know is told to it, and said by it alone."""
+    try:
+        _work(*arguments)
+    except (DsarError, OSError) as error:
+        said.put(error)
+        sys.exit(1)
+    except RuntimeError as error:
+        if _BACKEND not in str(error):
+            raise
+        sys.exit(1)  # the group broke: whoever broke it says why
+
+
 def _work(
-    rendezvous: str, number: int, count: int, work: Callable[..., None], arguments: tuple[Any, ...]
+    number: int, rendezvous: str, count: int, work: Callable[..., None], arguments: tuple[Any, ...]
 ) -> None:
     os.environ.setdefault("GLOO_SOCKET_IFNAME", "lo")
     with _group(rendezvous, number, count):
@@ -118,7 +166,7 @@ def _work(
 
 @contextmanager
 def _group(method: str, number: int, count: int) -> Iterator[None]:
-    dist.init_process_group("gloo", init_method=method, rank=number, world_size=count)
+    dist.init_process_group(_BACKEND, init_method=method, rank=number, world_size=count)
     try:
         with _one_thread():
             yield

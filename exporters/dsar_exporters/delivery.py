@@ -4,7 +4,6 @@ Memory does not grow with the length of the sequence: one frame is at hand, and 
 """
 
 import logging
-import os
 import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -13,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
+from dsar.drafts import storing
 from dsar.errors import DsarError, ExportError
 from dsar.types import Gaussians, GaussianSequence
 from dsar_exporters.checks import check_sequence, checked_frames
@@ -76,12 +76,12 @@ class _Timed:
 
     def write(self, frame: int, gaussians: Gaussians) -> None:
         """Write a frame."""
-        with self._counted(), _named(self.output.path):
+        with self._counted(), storing(self.output.path):
             self._sink(frame, gaussians)
 
     def close(self) -> None:
         """Put the files in their place."""
-        with self._counted(), _named(self.output.path):
+        with self._counted(), storing(self.output.path):
             self._opened.__exit__(None, None, None)
 
     @contextmanager
@@ -102,8 +102,8 @@ def export(sequence: GaussianSequence, outputs: Sequence[Output]) -> list[Delive
         outputs: Formats and places, each place once.
 
     Raises:
-        ExportError: The sequence or an output is not fit, or a folder cannot be written. Outputs that could
-            be finished are in their place.
+        ExportError: The sequence or an output is not fit. Outputs that could be finished are in their place.
+        StorageError: Something cannot be written; likewise.
         MissingDependencyError: A format's library is not installed.
     """
     check_sequence(sequence)
@@ -115,7 +115,7 @@ def export(sequence: GaussianSequence, outputs: Sequence[Output]) -> list[Delive
         for output in outputs:
             sink = _Timed(output)
             sinks.append(sink)
-            with _named(output.path):
+            with storing(output.path):
                 # Whatever happens before all frames have passed, happens to every output.
                 stack.push(sink.open(sequence))
         began = time.perf_counter()
@@ -180,16 +180,3 @@ def _existing(path: Path) -> Path:
     """Return the path, or the nearest one above it, that is a folder."""
     path = path.absolute()
     return next(folder for folder in (path, *path.parents) if folder.is_dir())
-
-
-@contextmanager
-def _named(path: Path) -> Iterator[None]:
-    """Turn what the system says of a file into one clear error."""
-    try:
-        yield
-    except OSError as error:
-        reason = os.strerror(error.errno) if error.errno else str(error)
-        raise ExportError(
-            f"{path}: cannot be written: {reason}; no broken file was left: check the folder's permissions "
-            "and the space on its disk"
-        ) from error

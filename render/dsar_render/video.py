@@ -1,6 +1,9 @@
 """Videos for review, through the ffmpeg that imageio-ffmpeg carries."""
 
+import errno
 import itertools
+import os
+import signal
 import subprocess
 from collections.abc import Iterable
 from pathlib import Path
@@ -8,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from dsar.drafts import replacing
+from dsar.drafts import quoted_error, replacing
 from dsar.errors import ExportError, MissingDependencyError
 
 
@@ -44,8 +47,11 @@ def write_mp4(images: Iterable[UInt8[np.ndarray, "h w 3"]], path: Path, *, fps: 
                 encoder.communicate()
                 raise
             log = encoder.communicate()[1].decode(errors="replace").strip()
+        if encoder.returncode == -signal.SIGXFSZ:
+            raise OSError(errno.EFBIG, os.strerror(errno.EFBIG))
         if encoder.returncode:
-            raise ExportError(f"{path.name}: ffmpeg stopped with code {encoder.returncode}: {log}")
+            failed = ExportError(f"{path}: ffmpeg stopped with code {encoder.returncode}: {log}")
+            raise quoted_error(log) or failed
     return path
 
 

@@ -14,7 +14,7 @@ import pytest
 import torch
 from pxr import Usd
 
-from dsar.errors import ExportError
+from dsar.errors import ExportError, StorageError
 from dsar_exporters import (
     CompressedPlySequence,
     GltfSnapshot,
@@ -106,7 +106,7 @@ def test_a_broken_rollout_leaves_every_older_file_whole(make_sequence, breaking_
 @pytest.mark.parametrize("kind", range(5), ids=["usd", "ply", "compressed", "spz", "glb"])
 def test_a_folder_that_cannot_be_made_is_one_error(make_sequence, tmp_path, kind):
     (tmp_path / "file").write_text("in the way")
-    with pytest.raises(ExportError, match=r"file.*cannot be written: .*check the folder's permissions"):
+    with pytest.raises(StorageError, match=r"file.*cannot be written: .*: give another path"):
         export(make_sequence(), [every_format(tmp_path / "file")[kind]])
 
 
@@ -249,7 +249,7 @@ def test_an_asset_that_cannot_be_put_in_place_leaves_the_older_one(make_sequence
         replace(source, target)
 
     monkeypatch.setattr("dsar_exporters.usd.os.replace", fail_at_the_root)
-    with pytest.raises(ExportError, match="cannot be written: Permission denied"):
+    with pytest.raises(StorageError, match=r"a\.usda: cannot be written: Permission denied: write elsewhere"):
         write_usd(make_sequence(frames=3), path, name="new", clips=True)
     assert {each: each.read_bytes() for each in tmp_path.rglob("*") if each.is_file()} == before
 

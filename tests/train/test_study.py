@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from dsar.drafts import write_whole
 from dsar.errors import ConfigError
 from dsar.evaluation.report import write_report
 from dsar.evaluation.stress import run_causal
@@ -17,7 +18,7 @@ from dsar.evaluation.study import (
     summarize_tables,
     to_markdown,
 )
-from dsar.training.checkpoint import Run, write_whole
+from dsar.training.checkpoint import Run
 
 TINY = {
     "tiny": Table(

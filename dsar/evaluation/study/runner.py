@@ -13,12 +13,13 @@ from typing import Any
 
 from dsar.config import PRESETS, TrainConfig, config_to_json
 from dsar.data.capture import capture_of
+from dsar.drafts import write_whole
 from dsar.errors import ConfigError
 from dsar.evaluation.heldout import evaluate
 from dsar.evaluation.stress import CASES, Case, stress
 from dsar.evaluation.study.tables import Row, Table
 from dsar.network import STREAMS, Stream
-from dsar.training.checkpoint import Run, load_checkpoint, read_progress, write_whole
+from dsar.training.checkpoint import Run, load_checkpoint, read_progress
 from dsar.training.loop import train
 from dsar.training.report import Report
 
