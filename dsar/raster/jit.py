@@ -1,11 +1,15 @@
 """The two decorators of the kernels: how Numba compiles them."""
 
 import inspect
+import logging
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 from numba import njit
+
+_logger = logging.getLogger(__name__)
 
 _OPTIONS = {
     # Freedom to fuse and reorder, so that loops vectorise. NaN keeps its meaning: culling needs it.
@@ -29,9 +33,34 @@ def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a function that Python calls: kept on disk once compiled, and able to run beside other threads.
 
-    Numba itself notices edits of the kernel's own file only; what kernels share is watched here.
+    Numba itself notices edits of the kernel's own file only; what kernels share is watched here. Where no
+    disk keeps it, the kernel is compiled anew in every process.
     """
-    dispatcher = njit(cache=True, nogil=True, **_OPTIONS)(inspect.unwrap(function))
-    stored = dispatcher._cache._cache_file  # pyright: ignore[reportAttributeAccessIssue]  # no public way
-    stored._source_stamp = stored._source_stamp, _SHARED
+    plain = inspect.unwrap(function)
+    try:
+        dispatcher = njit(cache=True, nogil=True, **_OPTIONS)(plain)
+    except RuntimeError as error:  # neither the package's folder nor the user's takes files
+        _say_not_kept(str(error))
+        return njit(nogil=True, **_OPTIONS)(plain)
+    kept: Any = dispatcher._cache  # pyright: ignore[reportAttributeAccessIssue]  # no public way
+    kept._cache_file._source_stamp = kept._cache_file._source_stamp, _SHARED
+    save = kept.save_overload
+
+    def save_if_there_is_room(*compiled: Any) -> None:
+        try:
+            save(*compiled)
+        except OSError as error:
+            _say_not_kept(str(error))
+
+    kept.save_overload = save_if_there_is_room
     return dispatcher
+
+
+@cache
+def _say_not_kept(reason: str) -> None:
+    """Say once that compiled kernels are not kept."""
+    _logger.warning(
+        "The rasteriser's compiled kernels cannot be kept, and are compiled every time (about 30 s): %s; "
+        "NUMBA_CACHE_DIR names a folder that takes them",
+        reason,
+    )

@@ -8,11 +8,12 @@ from typing import Any, Literal
 import numpy as np
 
 from dsar.drafts import replacing
-from dsar.errors import ExportError
+from dsar.errors import ExportError, StorageError
 from dsar.types import Camera, Picture
 from dsar_exporters.checks import check_name
 from dsar_exporters.color import ColorTarget
 from dsar_exporters.exr.channels import color_channels, crop, data_channels
+from dsar_exporters.exr.completeness import is_whole
 from dsar_exporters.exr.cryptomatte import matte_metadata
 from dsar_exporters.exr.deep import deep_channels
 from dsar_exporters.exr.header import NO_COLOR, Window, make_header, openexr
@@ -161,9 +162,15 @@ def _part(header: dict[str, Any], channels: dict[str, Any], name: str, compressi
 
 
 def write_parts(path: Path, parts: Sequence[Any]) -> None:
-    """Write a file that appears when it is complete."""
+    """Write a file that appears when it is complete.
+
+    Raises:
+        StorageError: The disk does not take it.
+    """
     with replacing(path) as draft:
         openexr().File(list(parts)).write(str(draft))
+        if not is_whole(draft):
+            raise StorageError(f"{path}: the disk did not take its end: free some room, or write elsewhere")
 
 
 def _holds(path: Path, views: Sequence[tuple[str, str]]) -> bool:

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from dsar.drafts import quoted_error
 from dsar.errors import ExportError, MissingDependencyError
 from dsar.geometry.paths import TURNTABLE, CameraPath
 from dsar.types import Camera, Gaussians, GaussianSequence
@@ -255,7 +256,5 @@ def _library_errors(path: Path) -> Iterator[None]:
     except Tf.ErrorException as error:
         # Of a chain of errors the first is the cause; USD quotes its words.
         reasons = [each.commentary.strip() for each in error.args if hasattr(each, "commentary")]
-        raise ExportError(
-            f"{path}: USD could not write it: {(reasons or [str(error)])[0]}; no broken file was "
-            "left: check the space on its disk"
-        ) from error
+        reason = (reasons or [str(error)])[0]
+        raise quoted_error(reason) or ExportError(f"{path}: USD could not write it: {reason}") from error

@@ -1,14 +1,18 @@
 """Which files are there already, whole and of this very job."""
 
 import dataclasses
+import os
 from pathlib import Path
 
 import pytest
 from exr_files import (
     write,
 )
+from faults import contents, full_disk
 
+from dsar.errors import StorageError
 from dsar_exporters import ColorTarget, ExrSequence
+from dsar_exporters.exr.completeness import is_whole
 
 
 @pytest.fixture(params=["zips", "dwaa", "multipart"])
@@ -74,6 +78,28 @@ def test_a_file_that_is_cut_off_anywhere_is_noticed(written, capfd):
     assert complete(sequence)
     # OpenEXR says on its own channels what it found.
     capfd.readouterr()
+
+
+def test_the_end_of_a_file_is_found_wherever_it_is_cut(written):
+    for path in written[1]:
+        content = path.read_bytes()
+        assert is_whole(path)
+        for length in range(len(content)):
+            os.truncate(path, len(content) - 1 - length)
+            assert not is_whole(path), (path.name, length)
+        path.write_bytes(content + b"0")
+        assert not is_whole(path)
+
+
+@pytest.mark.parametrize("missing", [1, 10, 700, 3000, 5000])
+def test_a_disk_that_takes_all_but_the_end_leaves_the_earlier_file(picture, tmp_path, missing):
+    """OpenEXR writes the last kilobytes when it closes a file, and does not look whether that went well."""
+    sequence = ExrSequence(tmp_path, layers=("rgba",))
+    (path, _) = sequence.write([picture], ["old"])
+    before = contents(tmp_path)
+    with full_disk(path.stat().st_size - missing), pytest.raises(StorageError, match="free some room"):
+        sequence.write([picture], ["new"])
+    assert contents(tmp_path) == before
 
 
 def test_something_else_in_a_files_place_is_noticed(written):
