@@ -108,8 +108,9 @@ def check_file(path: Path) -> None:
     Raises:
         StorageError: a folder is there, or its own folder cannot be made or written to.
     """
-    if path.is_dir():
-        raise StorageError(f"{path}: expected the name of a file to write, found a folder: {_OTHER}")
+    with storing(path):
+        if path.is_dir():
+            raise StorageError(f"{path}: expected the name of a file to write, found a folder: {_OTHER}")
     _check_parent(path, path.absolute().parent)
 
 

@@ -65,3 +65,8 @@ class MissingDependencyError(DsarError, ImportError):
     def __init__(self, feature: str, package: str, extra: str) -> None:
         """Name the feature, the package it lacks and the extra that brings it."""
         super().__init__(f"{feature} needs {package}: pip install 'dsar-avatar[{extra}]'")
+        self._named = feature, package, extra
+
+    def __reduce__(self) -> tuple[type["MissingDependencyError"], tuple[str, str, str]]:
+        """Come out of another process as what it is."""
+        return type(self), self._named

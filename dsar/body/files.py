@@ -119,14 +119,17 @@ def load_hands(path: Path) -> tuple[Float[Tensor, "2 k 45"], Float[Tensor, "2 45
 
 def _read_arrays(path: Path, also: tuple[str, ...] = ()) -> dict[str, np.ndarray]:
     """Return the arrays of a body file that we use; the rest is not opened."""
-    if path.suffix not in (".npz", ".pkl"):
+    kind = path.suffix.lower()
+    if kind not in (".npz", ".pkl"):
         raise BodyError(f"body file {path}: expected a .npz or .pkl file, found suffix {path.suffix!r}")
     if not path.is_file():
         raise BodyError(f"body file {path}: no such file; give the path of an SMPL-X .npz or .pkl file")
     try:
-        found = _read_npz(path, also) if path.suffix == ".npz" else _read_pickle(path, also)
+        found = _read_npz(path, also) if kind == ".npz" else _read_pickle(path, also)
     except (*_DAMAGE_ERRORS, *PICKLE_ERRORS) as error:
-        raise BodyError(f"body file {path}: cannot be read ({error}); download it again") from error
+        raise BodyError(
+            f"body file {path}: cannot be read ({error}); expected a whole .npz or .pkl file"
+        ) from error
     missing = [key for key in _REQUIRED if key not in found]
     if not ("J_regressor" in found or {"j_template", "j_shapedirs"} <= found.keys()):
         missing.append("J_regressor")
@@ -165,7 +168,9 @@ def _as_numbers(path: Path, key: str, array: np.ndarray) -> np.ndarray:
     if array.dtype.kind != "f":
         return array.astype(np.int64)
     if not np.isfinite(array).all():
-        raise BodyError(f"body file {path}: {key} holds values that are not finite; download it again")
+        raise BodyError(
+            f"body file {path}: {key} holds values that are not finite; expected a file as it was published"
+        )
     return array.astype(np.float64)
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dsar.avatar.avatar import Avatar
 from dsar.avatar.rollout import roll_out
-from dsar.evaluation.frechet import CLIP, Film, find_i3d, frechet_distance, i3d_features, slice_features
+from dsar.evaluation.frechet import CLIP, Film, frechet_distance, i3d_features, load_i3d, slice_features
 from dsar.evaluation.views import render_white, to_bytes, true_view
 from dsar.evaluation.vmaf import vmaf, vmaf_missing
 from dsar.network import STREAMS, Stream
@@ -85,8 +85,8 @@ def _judges() -> tuple[dict[str, Callable[[Film], Tensor]], dict[str, str]]:
         judges["frechet_slices"] = partial(slice_features, network=load_lpips("alex"))
     else:
         skipped["frechet_slices"] = "LPIPS's weights are not on this machine: run tools/fetch_lpips.py"
-    if path := find_i3d():
-        judges["fvd"] = partial(i3d_features, network=torch.jit.load(path))
+    if (network := load_i3d()) is not None:
+        judges["fvd"] = partial(i3d_features, network=network)
     else:
         skipped["fvd"] = "it needs I3D as a TorchScript file, named by $DSAR_I3D; see frechet_slices"
     return judges, skipped

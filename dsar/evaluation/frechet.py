@@ -7,6 +7,7 @@ It is no FVD and cannot be compared with one. Both are biased where films are fe
 """
 
 import os
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -47,16 +48,25 @@ def _slices_of(clip: Float[Tensor, "t h w 3"], network: Lpips) -> Float[Tensor, 
     return torch.cat(found)
 
 
-def find_i3d() -> Path | None:
-    """Return the user's I3D file, if $DSAR_I3D names one.
+def load_i3d() -> nn.Module | None:
+    """Return the user's I3D network, if $DSAR_I3D names one.
 
     Raises:
-        ConfigError: it names a file that is not there.
+        ConfigError: what it names is not there, or is no network.
     """
     named = os.environ.get("DSAR_I3D")
-    if named and not Path(named).is_file():
+    if not named:
+        return None
+    if not Path(named).is_file():
         raise ConfigError(f"$DSAR_I3D names {named}, which is no file; expected I3D as TorchScript")
-    return Path(named) if named else None
+    try:
+        with warnings.catch_warnings():
+            # What the field shares is TorchScript, whatever torch would rather have.
+            warnings.simplefilter("ignore", DeprecationWarning)
+            return torch.jit.load(named)
+    except (RuntimeError, ValueError) as error:
+        reason = str(error).splitlines()[0]
+        raise ConfigError(f"$DSAR_I3D names {named}; expected I3D as TorchScript, found {reason}") from error
 
 
 @torch.no_grad()

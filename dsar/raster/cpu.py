@@ -155,7 +155,7 @@ def _bin(
     if total > _MOST_PAIRS:
         raise RasterError(
             f"rasterize: {len(order)} Gaussians cover {total} tiles of {TILE} x {TILE} pixels in all, more "
-            f"than the {_MOST_PAIRS} that can be listed; are scales in metres, and has training diverged?"
+            f"than the {_MOST_PAIRS} that can be listed; are scales in metres, and is the camera outside?"
         )
     tile_starts, splat_starts = place_pairs(cursors, tiles)
     pairs, places = np.empty((tile_starts[-1], 2), np.int32), np.empty(tile_starts[-1], np.int32)

@@ -11,6 +11,7 @@ from typing import Literal
 
 import torch
 from jaxtyping import Float
+from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
@@ -60,7 +61,7 @@ def load_lpips(net: Net = "alex") -> Lpips:
     """Return LPIPS with its trained weights, frozen: `alex` to report, `vgg` to optimise.
 
     Raises:
-        ConfigError: the weights have not been fetched to this machine.
+        ConfigError: the weights have not been fetched to this machine, or their file is damaged.
     """
     path = find_lpips_weights(net)
     if not path.exists():
@@ -69,7 +70,13 @@ def load_lpips(net: Net = "alex") -> Lpips:
             "or set DSAR_CACHE to the folder that holds them"
         )
     model = Lpips(net)
-    model.load_state_dict(load_file(path))
+    try:
+        model.load_state_dict(load_file(path))
+    except (SafetensorError, RuntimeError) as error:
+        raise ConfigError(
+            f"LPIPS ({net}): {path} is cut or holds something else ({str(error).splitlines()[0]}): delete it "
+            "and run `python tools/fetch_lpips.py` in a clone of DSAR again"
+        ) from error
     return model.eval()
 
 

@@ -1,9 +1,14 @@
+import errno
+import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
+from faults import full_disk, read_only
 
-from dsar.drafts import replacing
+from dsar.drafts import check_file, check_folder, quoted_error, replacing, storing, write_whole
+from dsar.errors import CaptureError, StorageError
 
 
 def test_a_finished_draft_replaces_the_file_and_makes_its_folder(tmp_path):
@@ -53,3 +58,65 @@ def test_drafts_of_killed_processes_are_swept_and_those_of_others_are_not(tmp_pa
         draft.write_text("whole")
         assert len(list(tmp_path.iterdir())) == 2
     assert sorted(tmp_path.iterdir()) == [elsewhere, tmp_path / "image.1003.exr"]
+
+
+def test_a_full_disk_names_the_file_and_keeps_the_old_one(tmp_path):
+    path = tmp_path / "figures.json"
+    write_whole(path, "old")
+    with full_disk(10), pytest.raises(StorageError, match=r"figures\.json: cannot be written: .*: free some"):
+        write_whole(path, "new " * 10)
+    assert list(tmp_path.iterdir()) == [path]
+    assert path.read_text() == "old"
+
+
+def test_what_libraries_quote_of_the_system_is_the_systems(tmp_path):
+    with pytest.raises(StorageError, match=r"a\.exr: cannot be written: No space left on device: free some"):
+        with storing(tmp_path / "a.exr"):
+            raise RuntimeError("Failed to write pixel data. No space left on device.")
+    with pytest.raises(RuntimeError, match="three channels"), storing(tmp_path / "a.exr"):
+        raise RuntimeError("expected three channels")
+    assert quoted_error("i/o error: FILE TOO LARGE (os error 27)").errno == errno.EFBIG
+    assert quoted_error("nothing of the kind") is None
+
+
+def test_what_is_read_while_a_file_is_written_has_its_own_name(tmp_path):
+    """A video takes its images as it goes: one that is missing is not the video's fault."""
+    for elsewhere in (tmp_path / "images" / "0001.png", Path("/nowhere/at/all.png")):
+        with pytest.raises(FileNotFoundError) as caught, replacing(tmp_path / "video.mp4"):
+            elsewhere.read_bytes()
+        assert caught.value.filename == str(elsewhere)
+    with pytest.raises(CaptureError, match="No such file or directory"), replacing(tmp_path / "video.mp4"):
+        raise CaptureError("image 0001.png: No such file or directory")
+
+
+def test_errors_about_drafts_and_folders_above_are_the_files_own(tmp_path):
+    path = tmp_path / "deep" / "a.exr"
+    for named in (path, tmp_path / "deep" / ".a.exr.host-1-x" / "draft", tmp_path / "deep", tmp_path):
+        with pytest.raises(StorageError, match=r"a\.exr: cannot be written: Stale file handle: .*mount"):
+            with storing(path):
+                raise OSError(errno.ESTALE, os.strerror(errno.ESTALE), str(named))
+
+
+def test_places_are_checked_without_leaving_a_trace(tmp_path):
+    (tmp_path / "file").write_text("")
+    (tmp_path / "lost").symlink_to(tmp_path / "nowhere")
+    check_file(tmp_path / "new" / "a.usda")
+    check_file(tmp_path / "file")
+    check_folder(tmp_path / "new" / "exr")
+    check_folder(tmp_path)
+    for check, path, message in (
+        (check_file, tmp_path, "expected the name of a file to write, found a folder"),
+        (check_file, tmp_path / "file" / "a.usda", "to be a folder, found a file"),
+        (check_folder, tmp_path / "file", "to be a folder, found a file"),
+        (check_folder, tmp_path / "file" / "exr", "to be a folder, found a file"),
+        (check_folder, tmp_path / "lost" / "exr", "found a link that leads nowhere"),
+        (check_file, tmp_path / ("a" * 300) / "b", "File name too long: give another path"),
+    ):
+        with pytest.raises(StorageError, match=message) as caught:
+            check(path)
+        assert str(caught.value).startswith(f"{path}: ")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "lost"]
+    with read_only(tmp_path):
+        for check in (check_file, check_folder):
+            with pytest.raises(StorageError, match="Permission denied: write elsewhere"):
+                check(tmp_path / "new" / "a")

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from dsar.errors import ConfigError
-from dsar.evaluation.frechet import find_i3d, frechet_distance, i3d_features, slice_features
+from dsar.evaluation.frechet import frechet_distance, i3d_features, load_i3d, slice_features
 from dsar.training.lpips import Lpips
 
 
@@ -59,4 +59,7 @@ def test_a_users_i3d_is_given_clips_as_it_expects_them(tmp_path, monkeypatch):
     assert (found[:, 1] < -0.5).all()
     monkeypatch.setenv("DSAR_I3D", str(tmp_path / "none.pt"))
     with pytest.raises(ConfigError, match=r"none\.pt"):
-        find_i3d()
+        load_i3d()
+    (tmp_path / "none.pt").write_bytes(b"no network")
+    with pytest.raises(ConfigError, match=r"none\.pt; expected I3D as TorchScript, found"):
+        load_i3d()

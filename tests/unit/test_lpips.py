@@ -98,6 +98,14 @@ def test_missing_weights_name_the_command_that_fetches_them(tmp_path, monkeypatc
         load_lpips("vgg")
 
 
+def test_damaged_weights_are_told_by_their_file(tmp_path, monkeypatch):
+    monkeypatch.setenv("DSAR_CACHE", str(tmp_path))
+    for contents in (b"", b"<html>", bytes(2000)):
+        find_lpips_weights("alex").write_bytes(contents)
+        with pytest.raises(ConfigError, match=r"lpips_alex\.safetensors is cut or holds something else"):
+            load_lpips("alex")
+
+
 @pytest.mark.parametrize("net", NETS)
 def test_converted_checkpoint_holds_the_same_network(net):
     model = make_random_lpips(net)
