@@ -133,8 +133,11 @@ def _check_parent(path: Path, folder: Path) -> None:
         if not there.is_dir():
             what = "a file" if there.exists() else "a link that leads nowhere"
             raise StorageError(f"{path}: expected {there} to be a folder, found {what}: {_OTHER}")
-        with tempfile.TemporaryFile(dir=there):
-            pass
+        try:
+            tempfile.TemporaryFile(dir=there).close()
+        except OSError as error:
+            # It speaks of a file whose name nobody gave.
+            raise StorageError(f"{path}: cannot be written: {explain(error)}") from error
 
 
 @cache
