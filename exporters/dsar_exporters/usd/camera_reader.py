@@ -14,12 +14,13 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float
-from pxr import Gf, Tf, Usd, UsdGeom
+from pxr import Gf, Usd, UsdGeom
 
 from dsar.errors import ExportError
 from dsar.geometry.paths import CameraPath
 from dsar.geometry.rotations import nearest_rotation
 from dsar.types import Camera
+from dsar_exporters.usd.stages import open_stage
 
 _logger = logging.getLogger(__name__)
 
@@ -39,7 +40,9 @@ def read_cameras(
     path: Path, frames: Sequence[int], resolution: tuple[int, int] | None, fps: float | None
 ) -> list[CameraPath]:
     """Read cameras; see `dsar_exporters.usd.read_usd_cameras`."""
-    stage = _open(path)
+    if not path.is_file():
+        raise ExportError(f"{path}: expected a USD file with cameras, found none: give its path")
+    stage = open_stage(path)
     _mend_types(stage)
     every = Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies())
     prims = [prim for prim in every if prim.IsA(UsdGeom.Camera)]
@@ -187,20 +190,6 @@ class _CameraReader:
         result = np.eye(4)
         result[:3, :3], result[:3, 3] = rotation, -rotation @ center
         return result
-
-
-def _open(path: Path) -> Usd.Stage:
-    if not path.is_file():
-        raise ExportError(f"{path}: expected a USD file with cameras, found none: give its path")
-    try:
-        # With payloads: our own assets keep the cameras that move in one.
-        return Usd.Stage.Open(str(path))
-    except Tf.ErrorException as error:
-        reasons = [each.commentary.strip() for each in error.args if hasattr(each, "commentary")]
-        raise ExportError(
-            f"{path}: expected a USD file, found one that USD cannot open: {(reasons or [str(error)])[0]}: "
-            "export it again"
-        ) from error
 
 
 def _mend_types(stage: Usd.Stage) -> None:
