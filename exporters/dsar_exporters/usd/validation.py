@@ -41,8 +41,8 @@ def refuse_faults(path: Path, frames: Sequence[int]) -> None:
     faults = list(usd_faults(path, frames))
     if faults:
         raise ExportError(
-            f"{path.name}: the written file has {len(faults)} faults: {'; '.join(faults[:3])}: the exporter "
-            "is wrong, please report it"
+            f"{path.name}: expected a sound file, found {len(faults)} faults in what was just written: "
+            f"{'; '.join(faults[:3])}: our writer or this usd-core is at fault, please report both"
         )
 
 
