@@ -301,8 +301,8 @@ def test_values_that_are_not_physical_are_refused_by_frame(make_sequence, tmp_pa
         ),
         (
             2,
-            "frame 1003: expected finite scales, .*: frame 1002 is finite: the motion holds such values there, "
-            "or the network made them on the way: look at the motion, or export frames up to 1002$",
+            "frame 1003: expected finite scales, .*: frame 1002 is finite: the motion holds such values "
+            "there, or the network made them on the way: look at the motion, or export frames up to 1002$",
         ),
     ],
 )

@@ -318,6 +318,19 @@ def test_a_camera_of_another_rate_is_taken_by_seconds_from_frame_1001(make_stage
     assert record.message.endswith("frame 1001 is time code 1001")
 
 
+def test_a_camera_of_another_rate_that_has_come_to_rest_is_where_it_came_to_rest(make_stage, caplog):
+    stage = make_stage(rate=120.0)
+    place = UsdGeom.Xformable(add_camera(stage, "/shot")).GetOrderedXformOps()[0]
+    for time in (1001, 1021):
+        place.Set(Gf.Vec3d(time - 1001, 0, 0), time)
+    # Frame 1010 is time code 1046 there, while time code 1010 is on the way.
+    (path,) = read(stage, frames=[1010], fps=24.0)
+    assert path.frames == ()
+    assert "moves at 1001 to 1021, stands still at 1041 to 1052" in caplog.text
+    center = -path.cameras[0].T_camera_world[:3, :3].T @ path.cameras[0].T_camera_world[:3, 3]
+    assert center[0] == pytest.approx(0.2)
+
+
 def test_a_turning_camera_of_another_rate_turns_and_is_not_sheared(make_stage):
     stage = make_stage(up="Y", rate=24.0)
     camera = UsdGeom.Xformable(UsdGeom.Camera.Define(stage, "/shot"))
@@ -347,6 +360,16 @@ def test_equal_rates_and_stages_that_say_none_count_frames(make_stage, caplog):
         stage.SetFramesPerSecond(60.0)
         assert read(stage, fps=30.0)[0].frames[:2] == (1000.0, 1000.5)
     assert [record.message.count("by seconds") for record in caplog.records] == [1]
+
+
+def test_a_rate_that_is_none_is_refused_where_a_camera_moves(make_stage):
+    stage = make_stage(rate=-24.0)
+    place = UsdGeom.Xformable(add_camera(stage, "/shot")).GetOrderedXformOps()[0]
+    assert read(stage, fps=30.0)[0].frames == ()
+    for frame in (1001, 1006):
+        place.Set(Gf.Vec3d(frame, 0, 500), frame)
+    with pytest.raises(ExportError, match="camera /shot: expected time codes per second > 0, found -24"):
+        read(stage, fps=30.0)
 
 
 def test_only_chosen_cameras_are_judged_and_all_have_names(make_stage):

@@ -93,16 +93,15 @@ class _CameraReader:
     ) -> CameraPath:
         """Return the camera: at rest, or keyed at frames and their neighbours, or around these."""
         size = self._size(resolution)
-        ratio = self._ratio(fps)
         keys = sorted({frame + step for frame in frames for step in (-1, 0, 1)})
+        ratio = self._ratio(fps) if self._may_move() else 1.0
         if ratio != 1:
             # The stage's own time codes around the keys: between them USD may interpolate matrices, which
             # shears what turns, and a path turns.
             times = [START_FRAME + (key - START_FRAME) / ratio for key in keys]
             keys = sorted({math.floor(time) + step for time in times for step in (0, 1)})
-        states = self._states(keys[:1])
         if not (self._may_move() and self._moves_at(keys)):
-            return CameraPath((self._camera(states[0], size),))
+            return CameraPath((self._camera(self._states(keys[:1])[0], size),))
         cameras = tuple(self._camera(state, size) for state in self._states(keys))
         if ratio == 1:
             return CameraPath(cameras, tuple(keys))
