@@ -198,6 +198,8 @@ class Render(Drive):
         if self.res is None and any(each in _MADE and each not in names for each in wanted):
             # Cameras that are made here have the first one's size.
             chosen.add(names[0])
+        if not chosen:
+            return []
         if self.cameras is None:
             return [CameraPath((camera,)) for camera in performance.cameras if camera.name in chosen]
         if _is_usd(self.cameras):
