@@ -38,7 +38,7 @@ class Export(Drive):
     name: str = "avatar"
     """Name of the asset and of the files."""
     check: Path | None = None
-    """Write nothing; say what is wrong with this file, whoever wrote it (USD, PLY or SPZ)."""
+    """Write nothing; say what is wrong with this file, whoever wrote it (USD, PLY, SPZ or GLB)."""
 
     def files(self) -> list[Path]:
         """Return the files of a name of their own."""

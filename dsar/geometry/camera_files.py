@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,16 +20,38 @@ _FRAME = re.compile(r"-?\d+", re.ASCII)
 _RIGID_TOLERANCE = 1e-4
 
 
-def read_cameras_json(path: Path) -> list[CameraPath]:
+def list_cameras_json(path: Path) -> list[str]:
+    """Return the names of a file's cameras, whatever else is wrong with these.
+
+    Raises:
+        ConfigError: It cannot be read, or a name is no identifier or is there twice.
+    """
+    return list(_by_name(_load(path), path))
+
+
+def read_cameras_json(path: Path, *, chosen: Collection[str] | None = None) -> list[CameraPath]:
     """Read cameras, in the file's order; a `capture.json` is such a file.
 
     `{"cameras": [{"name": ..., "K": ..., "T_camera_world": ..., "width": ..., "height": ...}]}`, with
     `"frames": {"1001": {"T_camera_world": ..., "K": ...}}` where a camera moves. What a frame does not say it
     takes from the camera.
 
+    Args:
+        path: The file.
+        chosen: Names of the cameras to read; others may be malformed. None: every one.
+
     Raises:
         ConfigError: It cannot be read, or a camera is incomplete or malformed.
     """
+    return [
+        _read_path(entry, where)
+        for name, (where, entry) in _by_name(_load(path), path).items()
+        if chosen is None or name in chosen
+    ]
+
+
+def _load(path: Path) -> Mapping[str, Any]:
+    """Return a file's record, which has a list of cameras."""
     try:
         record = json.loads(path.read_text())
     except (OSError, ValueError) as error:
@@ -43,9 +65,23 @@ def read_cameras_json(path: Path) -> list[CameraPath]:
             f'{path}: expected {{"cameras": [...]}} with at least one camera, found {_shown(record)}: write '
             "it as in docs/capture-format.md"
         )
-    cameras = [_read_path(entry, f"{path}, camera {index}") for index, entry in enumerate(entries)]
-    _refuse_doubled([camera.name for camera in cameras], str(path))
-    return cameras
+    return record
+
+
+def _by_name(record: Mapping[str, Any], path: Path) -> dict[str, tuple[str, Mapping[str, Any]]]:
+    """Return how errors call each camera, and what the file says of it, by its name."""
+    names, found = [], []
+    for index, entry in enumerate(record["cameras"]):
+        where = f"{path}, camera {index}"
+        if not isinstance(entry, dict):
+            raise ConfigError(
+                f"{where}: expected name, K, T_camera_world, width and height, found {_shown(entry)}: "
+                "correct it"
+            )
+        names.append(_checked_name(entry.get("name"), where))
+        found.append((f"{where} {names[-1]}", entry))
+    _refuse_doubled(names, str(path))
+    return dict(zip(names, found, strict=True))
 
 
 def write_cameras_json(paths: Sequence[CameraPath], path: Path) -> Path:
@@ -82,13 +118,8 @@ def _written(path: CameraPath) -> str:
     return f'{json.dumps(record)[:-1]}, "frames": {{\n' + ",\n".join(frames) + "\n}}"
 
 
-def _read_path(entry: object, where: str) -> CameraPath:
-    if not isinstance(entry, dict):
-        raise ConfigError(
-            f"{where}: expected name, K, T_camera_world, width and height, found {_shown(entry)}: correct it"
-        )
-    name = _checked_name(entry.get("name"), where)
-    where = f"{where} {name}"
+def _read_path(entry: Mapping[str, Any], where: str) -> CameraPath:
+    name = entry["name"]
     size = _size(entry, "width", where), _size(entry, "height", where)
     frames = entry.get("frames")
     if frames is None:
