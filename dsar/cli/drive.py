@@ -4,9 +4,10 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from dsar.cli.common import OnRun, capture_sequence
+from dsar.errors import ConfigError
 from dsar.types import Camera, GaussianSequence, Motion
 
 if TYPE_CHECKING:
@@ -36,6 +37,10 @@ class Drive(OnRun):
 
     motion: str = "test"
     """An AMASS/SMPL-X .npz or .bvh file, a sequence of the run's capture, or its split `test` or `train`."""
+    up: Literal["y", "z"] | None = None
+    """Which axis is up in the motion file; default: found from how people stand in it."""
+    motion_fps: float | None = None
+    """Frames per second of the motion file, where it says none or a wrong one."""
     frames: str | None = None
     """Frame numbers from 1001 on, e.g. 1001-1100x2; default: all."""
 
@@ -51,6 +56,7 @@ class Drive(OnRun):
         from dsar.data.capture import capture_of
         from dsar.data.motion import read_motion, resample
         from dsar.data.novelty import report_novelty
+        from dsar.data.plausibility import judge_motion
         from dsar.training.checkpoint import Run, load_checkpoint
 
         self.check_device()
@@ -58,9 +64,11 @@ class Drive(OnRun):
         capture = capture_of(config)
         name = capture_sequence(capture, self.motion)
         if name is not None:
+            self._refuse_file_flags(name)
             motion = capture.motions[name]
         else:
-            motion = read_motion(Path(self.motion), avatar.body)
+            motion = read_motion(Path(self.motion), avatar.body, up=self.up, fps=self.motion_fps)
+            judge_motion(avatar.body, motion)
         if motion.fps != avatar.fps:
             motion = resample(motion, avatar.fps)
         if name is None:
@@ -68,6 +76,14 @@ class Drive(OnRun):
             report_novelty(avatar.body, motion, known, START_FRAME)
         provenance["motion_hash"] = _hash(motion)
         return Performance(avatar, motion, tuple(capture.cameras), provenance)
+
+    def _refuse_file_flags(self, sequence: str) -> None:
+        """Raise ConfigError where flags for motion files stand beside a sequence of the capture."""
+        given = {"--up": self.up, "--motion-fps": self.motion_fps}
+        if flags := [flag for flag, value in given.items() if value is not None]:
+            raise ConfigError(
+                f"{', '.join(flags)}: for motion files; {sequence} is a sequence of the capture, leave out"
+            )
 
 
 def _hash(motion: Motion) -> str:

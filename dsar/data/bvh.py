@@ -1,10 +1,8 @@
-"""Motion capture in .bvh files, retargeted from CMU's skeleton to our body.
+"""Motion capture in .bvh files, whoever wrote them: a hierarchy of joints and their channels by frame."""
 
-Each joint takes the world rotation of its counterpart, corrected where the two skeletons' limbs point
-differently at rest (CMU's legs are splayed by 20 degrees). The hips follow the clip's, scaled by the length
-of the legs: the file's unit does not matter. Y is up in both.
-"""
-
+import codecs
+import logging
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,32 +11,17 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dsar.body.model import JOINT_NAMES
 from dsar.errors import MotionError
-from dsar.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
-from dsar.types import Body, Motion
+from dsar.geometry.rates import same_rate
+from dsar.geometry.rotations import matrix_from_axis_angle
 
-_SIDES = (("left", "Left"), ("right", "Right"))
-COUNTERPARTS = {
-    **{"pelvis": "Hips", "spine1": "LowerBack", "spine2": "Spine", "spine3": "Spine1"},
-    **{"neck": "Neck", "head": "Head"},
-    **{f"{ours}_hip": f"{theirs}UpLeg" for ours, theirs in _SIDES},
-    **{f"{ours}_knee": f"{theirs}Leg" for ours, theirs in _SIDES},
-    **{f"{ours}_ankle": f"{theirs}Foot" for ours, theirs in _SIDES},
-    **{f"{ours}_foot": f"{theirs}ToeBase" for ours, theirs in _SIDES},
-    **{f"{ours}_collar": f"{theirs}Shoulder" for ours, theirs in _SIDES},
-    **{f"{ours}_shoulder": f"{theirs}Arm" for ours, theirs in _SIDES},
-    **{f"{ours}_elbow": f"{theirs}ForeArm" for ours, theirs in _SIDES},
-    **{f"{ours}_wrist": f"{theirs}Hand" for ours, theirs in _SIDES},
-}
-"""CMU's joint for each of SMPL-X's 22 body joints."""
-# Limbs whose rest directions are matched, joint to joint. Trunk, hands and feet need none: both skeletons
-# rest upright with level soles and palms down.
-_CORRECTED = {
-    f"{side}_{start}": f"{side}_{end}"
-    for side, _ in _SIDES
-    for start, end in (("hip", "knee"), ("knee", "ankle"), ("shoulder", "elbow"), ("elbow", "wrist"))
-}
+_CHANNELS = {f"{axis}{kind}".lower(): f"{axis}{kind}" for axis in "XYZ" for kind in ("position", "rotation")}
+_POSITIONS = [f"{axis}position" for axis in "XYZ"]
+_BYTE_ORDER_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+_STANDARD_RATES = (24000 / 1001, 30000 / 1001, 60000 / 1001, 120000 / 1001)
+_UNTURNED = 0.9
+"""Share of a frame's rotations that are exactly zero: more are in a rest pose (CMU's turns legs and arms)."""
+LOGGER = logging.getLogger(__name__)
 
 
 @dataclass
@@ -53,48 +36,45 @@ class Skeleton:
     """Their places at rest relative to their parents, in the file's unit."""
     channels: list[list[str]] = field(default_factory=list)
     """What the columns of a frame say of them."""
+    tips: dict[int, list[float]] = field(default_factory=dict)
+    """Where the bones of the last joints end (`End Site`), relative to them."""
 
 
-def read_bvh(path: Path, body: Body) -> Motion:
-    """Return the motion of a clip on CMU's skeleton for a body in the Y-up world, float32.
+@dataclass(frozen=True)
+class Recording:
+    """What a .bvh file holds."""
 
-    A first frame without any rotation is left out: it is the T-pose that CMU's conversion to .bvh put in
-    front of the recording.
-
-    Raises:
-        MotionError: the file is missing or malformed, has no frames, or lacks a joint.
-    """
-    skeleton, values, fps = parse_bvh(path)
-    missing = sorted(set(COUNTERPARTS.values()) - set(skeleton.names))
-    if missing:
-        raise MotionError(
-            f"motion file {path}: lacks the joints {', '.join(missing)}; it has {', '.join(skeleton.names)}; "
-            "expected CMU's names, rename its joints"
-        )
-    turned = [channel.endswith("rotation") for channels in skeleton.channels for channel in channels]
-    if len(values) > 1 and not values[0, turned].any():
-        values = values[1:]
-    return retarget(skeleton, values, body, fps, path.stem)
+    skeleton: Skeleton
+    values: Float[np.ndarray, "f c"]
+    """The channels by frame: degrees, and the file's unit."""
+    fps: float
 
 
-def parse_bvh(path: Path) -> tuple[Skeleton, Float[np.ndarray, "f c"], float]:
-    """Return the skeleton, the channels' values (degrees, the file's unit) and the frames per second.
+def read_bvh(path: Path, fps: float | None = None) -> Recording:
+    """Return the skeleton and the frames of a file.
+
+    A first frame with almost no rotations is left out where the next has them: it is the T-pose that
+    conversions put in front of a recording.
+
+    Args:
+        path: The file; any encoding of its names, any line ends.
+        fps: Frames per second, where the file says none or a wrong one.
 
     Raises:
-        MotionError: the file is missing or malformed, or has no frames.
+        MotionError: the file is missing or malformed, has several roots, no bones or no frames.
     """
     if not path.is_file():
         raise MotionError(f"motion file {path}: no such file")
+    text = "\n".join(_decode(path.read_bytes()).splitlines())
+    start = re.search(r"^\s*MOTION\b", text, re.MULTILINE | re.IGNORECASE)
     try:
-        hierarchy, separator, motion = path.read_text().partition("MOTION")
-        if not separator:
+        if not start:
             raise ValueError("it has no MOTION")
-        skeleton = _parse_hierarchy(hierarchy)
-        lines = motion.split("\n")
-        lines = [line for line in lines if line.strip()]
-        count, seconds = int(lines[0].split()[-1]), float(lines[1].split()[-1])
+        skeleton = _parse_hierarchy(text[: start.start()])
+        lines = [line for line in text[start.end() :].splitlines() if line.strip()]
+        count, seconds = int(lines[0].split(":")[-1]), float(lines[1].split(":")[-1])
         rows = [[float(number) for number in line.split()] for line in lines[2:]]
-    except (OSError, UnicodeDecodeError, ValueError, IndexError) as error:
+    except (ValueError, IndexError) as error:
         raise MotionError(f"motion file {path}: cannot be read as .bvh ({error})") from error
     columns = sum(map(len, skeleton.channels))
     wrong = [number for number, row in enumerate(rows) if len(row) != columns]
@@ -102,97 +82,148 @@ def parse_bvh(path: Path) -> tuple[Skeleton, Float[np.ndarray, "f c"], float]:
         raise MotionError(
             f"motion file {path}: frame {wrong[0]} has {len(rows[wrong[0]])} numbers, expected {columns}"
         )
+    if 0 < count < len(rows):
+        LOGGER.warning(
+            "%s: announces %d frames and has %d; the last are left out", path.name, count, len(rows)
+        )
+        rows = rows[:count]
     if len(rows) != count or not rows:
         raise MotionError(f"motion file {path}: has {len(rows)} frames, expected {count} and at least one")
     values = np.array(rows)
     bad = np.argwhere(~np.isfinite(values))
-    if len(bad) or not 0 < seconds < np.inf:
-        where = f"frame {bad[0][0]}" if len(bad) else f"the frame time {seconds}"
-        raise MotionError(f"motion file {path}: {where} is not a finite number above what can be; cut it out")
-    # Files give the time of a frame in few digits: .0083333 is 120 a second.
+    if len(bad):
+        raise MotionError(f"motion file {path}: frame {bad[0][0]} is not a finite number; cut it out")
+    values = _without_scales(path, skeleton, values)
+    turned = [channel.endswith("rotation") for channels in skeleton.channels for channel in channels]
+    unturned = (values[:2, turned] == 0).mean(axis=1)
+    if len(values) > 1 and unturned[0] > _UNTURNED >= unturned[1]:
+        LOGGER.info(
+            "%s: its first frame, almost without rotations, is a rest pose and is left out", path.name
+        )
+        values = values[1:]
+    return Recording(skeleton, values, fps or _rate(path, seconds))
+
+
+def _decode(content: bytes) -> str:
+    """Return the text; names of joints may be in any encoding, all else is ASCII."""
+    if content.startswith(_BYTE_ORDER_MARKS):
+        return content.decode("utf-16", errors="replace")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return content.decode("latin-1")
+
+
+def _rate(path: Path, seconds: float) -> float:
+    """Return the frames per second; files give the time of a frame in few digits, .0083333 for 1/120."""
+    if not 0 < seconds < 1:
+        raise MotionError(
+            f"motion file {path}: the frame time {seconds:g} is not a finite number above 0 and "
+            "below one second; say its frames per second with --motion-fps"
+        )
     fps = 1 / seconds
-    return skeleton, values, float(round(fps)) if abs(fps - round(fps)) < 1e-4 * fps else fps
+    standard = next((rate for rate in _STANDARD_RATES if same_rate(fps, rate)), float(round(fps)))
+    return standard if same_rate(fps, standard) else fps
 
 
 def _parse_hierarchy(text: str) -> Skeleton:
-    skeleton, stack, is_end = Skeleton(), [], False
-    for words in map(str.split, text.splitlines()):
-        match words:
-            case ["ROOT" | "JOINT", name]:
-                skeleton.names.append(name)
+    """Return the hierarchy; raise ValueError with the joint and the fault."""
+    skeleton, stack, in_tip = Skeleton(), [], False
+    for words in map(str.split, re.sub(r"([{}])", r"\n\1\n", text).splitlines()):
+        match [words[0].upper(), *words[1:]] if words else []:
+            case ["ROOT" | "JOINT" as kind, *name]:
+                if (kind == "ROOT") == bool(skeleton.names):
+                    names = " and ".join([*skeleton.names[:1], " ".join(name)])
+                    raise ValueError(f"it has several roots, {names}; expected one figure, split the file")
+                if len(skeleton.names) != len(skeleton.channels):
+                    raise ValueError(f"the joint {skeleton.names[-1]} lacks its CHANNELS")
+                skeleton.names.append(" ".join(name))
                 skeleton.parents.append(stack[-1] if stack else -1)
-            case ["End", "Site"]:
-                is_end = True
+            case ["END", *_]:
+                in_tip = True
             case ["{"]:
                 stack.append(len(skeleton.names) - 1)
             case ["}"]:
+                if not stack:
+                    raise ValueError(f"a brace too many is closed after the joint {skeleton.names[-1]}")
                 stack.pop()
-                is_end = False
-            case ["OFFSET", *numbers] if not is_end:
-                skeleton.offsets.append([float(number) for number in numbers])
-            case ["CHANNELS", _, *channels]:
-                skeleton.channels.append(channels)
-    counts = {len(skeleton.names), len(skeleton.offsets), len(skeleton.channels)}
-    if len(counts) != 1 or not skeleton.names or any(len(offset) != 3 for offset in skeleton.offsets):
+                in_tip = False
+            case ["OFFSET", *numbers]:
+                place = [float(number) for number in numbers]
+                if len(place) != 3 or not np.isfinite(place).all():
+                    raise ValueError(f"the joint {skeleton.names[-1]} needs an OFFSET of three numbers")
+                if in_tip:
+                    skeleton.tips[stack[-1]] = place
+                else:
+                    skeleton.offsets.append(place)
+            case ["CHANNELS", count, *channels]:
+                skeleton.channels.append(_check_channels(skeleton.names[-1], int(count), channels))
+    if stack:
+        raise ValueError(f"the brace of the joint {skeleton.names[stack[-1]]} is not closed")
+    if len({len(skeleton.names), len(skeleton.offsets), len(skeleton.channels)}) != 1 or not skeleton.names:
         raise ValueError("a joint lacks its name, its OFFSET of three numbers or its CHANNELS")
-    if not {"Xposition", "Yposition", "Zposition"} <= set(skeleton.channels[0]):
+    if not any(set(_POSITIONS) <= set(channels) for channels in skeleton.channels):
         raise ValueError("its root has no position")
     return skeleton
+
+
+def _check_channels(joint: str, count: int, channels: list[str]) -> list[str]:
+    known = [_CHANNELS.get(channel.lower(), channel) for channel in channels]
+    if count != len(known):
+        raise ValueError(f"the joint {joint} announces {count} channels and names {len(known)}")
+    strange = [
+        name for name in known if name not in _CHANNELS.values() and not name.lower().endswith("scale")
+    ]
+    if strange:
+        raise ValueError(
+            f"the joint {joint} has channels {', '.join(strange)}; expected positions and rotations"
+        )
+    positions = [name for name in known if name in _POSITIONS]
+    if len(set(known)) != len(known) or len(positions) not in (0, 3):
+        raise ValueError(f"the joint {joint} has the channels {', '.join(known)}; expected each axis once")
+    return known
+
+
+def _without_scales(
+    path: Path, skeleton: Skeleton, values: Float[np.ndarray, "f c"]
+) -> Float[np.ndarray, "f d"]:
+    """Return the values without scales, which must be constant: bones do not stretch."""
+    scales = np.array([name not in _CHANNELS.values() for names in skeleton.channels for name in names])
+    if not scales.any():
+        return values
+    if np.ptp(values[:, scales], axis=0).max() > 1e-3 * np.abs(values[:, scales]).max():
+        raise MotionError(
+            f"motion file {path}: its joints change their scale; export it without scale channels"
+        )
+    LOGGER.warning("%s: %d scale channels, all constant, are left out", path.name, scales.sum())
+    skeleton.channels = [
+        [name for name in names if name in _CHANNELS.values()] for names in skeleton.channels
+    ]
+    return values[:, ~scales]
 
 
 def pose_skeleton(
     skeleton: Skeleton, values: Float[np.ndarray, "f c"]
 ) -> tuple[Float[Tensor, "f j 3 3"], Float[Tensor, "f j 3"]]:
-    """Return the rotation of every joint in the world, by frame, and its place in the file's unit."""
+    """Return the rotation of every joint in the world, by frame, and its place in the file's unit.
+
+    A joint's position channels stand in place of its OFFSET, which stays where they are zero throughout.
+    """
     axes = dict(zip("XYZ", torch.eye(3, dtype=torch.float64), strict=True))
     columns = torch.from_numpy(values).split([len(channels) for channels in skeleton.channels], dim=1)
     turns: list[Tensor] = []
-    order = [skeleton.channels[0].index(f"{axis}position") for axis in "XYZ"]
-    places = [columns[0][:, order]]
-    for parent, channels, column in zip(skeleton.parents, skeleton.channels, columns, strict=True):
-        turn = turns[parent] if parent >= 0 else torch.eye(3, dtype=torch.float64).expand(len(values), 3, 3)
+    places: list[Tensor] = []
+    for parent, offset, channels, column in zip(
+        skeleton.parents, skeleton.offsets, skeleton.channels, columns, strict=True
+    ):
+        turn = torch.eye(3, dtype=torch.float64).expand(len(values), 3, 3)
         for channel, value in zip(channels, column.T, strict=True):
             if channel.endswith("rotation"):
                 turn = turn @ matrix_from_axis_angle(value.deg2rad()[:, None] * axes[channel[0]])
-        turns.append(turn)
-    for parent, offset in list(zip(skeleton.parents, skeleton.offsets, strict=True))[1:]:
-        places.append(places[parent] + turns[parent] @ torch.tensor(offset, dtype=torch.float64))
+        place = torch.tensor(offset, dtype=torch.float64).expand(len(values), 3)
+        if set(_POSITIONS) <= set(channels):
+            moved = column[:, [channels.index(channel) for channel in _POSITIONS]]
+            place = moved if parent < 0 or moved.any() else place
+        turns.append(turn if parent < 0 else turns[parent] @ turn)
+        places.append(place if parent < 0 else places[parent] + (turns[parent] @ place[..., None])[..., 0])
     return torch.stack(turns, 1), torch.stack(places, 1)
-
-
-def retarget(
-    skeleton: Skeleton, values: Float[np.ndarray, "f c"], body: Body, fps: float, name: str
-) -> Motion:
-    """Return the motion of a body whose limbs point where the clip's do and whose hips are there too."""
-    (turns, places), joints = pose_skeleton(skeleton, values), body.joints.double()
-    offset = dict(zip(skeleton.names, torch.tensor(skeleton.offsets, dtype=torch.float64), strict=True))
-    index = {name: i for i, name in enumerate(JOINT_NAMES)}
-    world = torch.eye(3, dtype=torch.float64).repeat(len(turns), len(JOINT_NAMES), 1, 1)
-    for ours, theirs in COUNTERPARTS.items():
-        turn = turns[:, skeleton.names.index(theirs)]
-        if end := _CORRECTED.get(ours):
-            limb = joints[index[end]] - joints[index[ours]]
-            turn = turn @ _shortest_rotation(limb, offset[COUNTERPARTS[end]])
-        world[:, index[ours]] = turn
-    local = torch.stack([world[:, max(p, 0)].mT @ world[:, j] for j, p in enumerate(body.parents)], 1)
-    local[:, 0] = world[:, 0]
-    local[:, len(COUNTERPARTS) :] = torch.eye(3, dtype=torch.float64)
-
-    legs = [COUNTERPARTS[f"{side}_{joint}"] for side, _ in _SIDES for joint in ("knee", "ankle")]
-    ends = [index["left_knee"], index["left_ankle"]]
-    scale = (
-        2
-        * sum((joints[end] - joints[body.parents[end]]).norm() for end in ends)
-        / sum(offset[leg].norm() for leg in legs)
-    )
-    their_hips = places[:, [skeleton.names.index(f"{side}UpLeg") for _, side in _SIDES]].mean(1)
-    our_hips = (joints[index["left_hip"]] + joints[index["right_hip"]]) / 2 - joints[0]
-    pelvis = scale * their_hips - world[:, 0] @ our_hips
-    return Motion(axis_angle_from_matrix(local).float(), (pelvis - joints[0]).float(), fps, name)
-
-
-def _shortest_rotation(source: Float[Tensor, "3"], target: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
-    """Return the rotation matrix without roll that carries one direction to another."""
-    axis = torch.linalg.cross(source, target)
-    angle = torch.atan2(axis.norm(), source @ target)
-    return matrix_from_axis_angle(torch.nn.functional.normalize(axis, dim=0) * angle)

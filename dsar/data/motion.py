@@ -1,10 +1,11 @@
 """Motion files: AMASS and SMPL-X .npz and .bvh to our `Motion`, .npz back, and changes of frame rate.
 
-The .npz have Z up and the axis-angles of SMPL-X, SMPL-H or SMPL; a `Motion` has Y up and SMPL-X's 55
-joints. Their shape coefficients are not read: the avatar moves with its own shape.
+A `Motion` has Y up and SMPL-X's 55 joints; files have any axis up and .bvh any skeleton of a person. Shape
+coefficients are not read: the avatar moves with its own shape.
 """
 
 import dataclasses
+import logging
 import os
 from pathlib import Path
 
@@ -13,41 +14,112 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dsar.data.bvh import read_bvh
+from dsar.data.bvh import Skeleton, pose_skeleton, read_bvh
+from dsar.data.orientation import Up, Uprightness, find_up, joint_places, quarter_turn
 from dsar.data.poses import read_arrays, read_poses, read_rate
+from dsar.data.retarget import Clip, body_places, bones_of, leg_length, retarget, standing_rest
+from dsar.data.skeletons import Figure, find_figure
 from dsar.errors import MotionError
+from dsar.geometry.rates import same_rate
 from dsar.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
 from dsar.types import Body, Motion
 
 EMBEDDED_MOTIONS = Path(__file__).parent / "embedded_motion"
 """Clips that come with the package, from the CMU motion capture database (mocap.cs.cmu.edu)."""
 
-_Y_UP_FROM_Z_UP = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
+_HINTS = dict.fromkeys(
+    (".pkl", ".pt", ".pth", ".npy"),
+    "save its arrays as .npz: poses (frames, 165 axis-angles), trans (frames, 3), mocap_frame_rate",
+) | dict.fromkeys((".fbx", ".c3d", ".glb", ".gltf", ".usd", ".usda", ".usdc"), "export it as .bvh")
+LOGGER = logging.getLogger(__name__)
 
 
-def read_motion(path: Path, body: Body) -> Motion:
-    """Return the motion of a file in the Y-up world, float32.
+def read_motion(path: Path, body: Body, *, up: Up | None = None, fps: float | None = None) -> Motion:
+    """Return the motion of a file in the Y-up world, float32, and log what the file was taken for.
 
     Joints that the file lacks stay at rest.
 
     Args:
-        path: an AMASS or SMPL-X .npz with `poses` (or its parts), `trans` and a frame rate, Z up, radians,
-            metres; or a .bvh on CMU's skeleton (`dsar.data.bvh`).
+        path: an AMASS, SMPL-X, SMPL-H or SMPL .npz with `poses` (or its parts), `trans` and a frame rate,
+            radians, metres; or a .bvh of a person's skeleton in any rest pose and unit (docs/motions.md).
         body: the body that will move: turning the world turns it about its pelvis.
+        up: which axis is up in the file; None: found from the motion.
+        fps: the file's frames per second, where it says none or a wrong one.
 
     Raises:
-        MotionError: the file is missing, unreadable, incomplete, empty or not finite.
+        MotionError: the file is missing, unreadable, incomplete, empty, not finite or no person's.
     """
-    if path.suffix == ".bvh":
-        return read_bvh(path, body)
-    if path.suffix != ".npz":
+    if fps is not None and not 0 < fps < float("inf"):
+        raise MotionError(f"motion file {path}: --motion-fps {fps:g}, expected frames per second above 0")
+    kind = path.suffix.lower()
+    if kind == ".bvh":
+        return _read_bvh(path, body, up, fps)
+    if kind != ".npz":
+        hint = f"; {_HINTS[kind]}" if kind in _HINTS else ""
         raise MotionError(
-            f"motion file {path}: expected an AMASS or SMPL-X .npz or a .bvh, found {path.suffix!r}"
+            f"motion file {path}: expected an AMASS or SMPL-X .npz or a .bvh, found {path.suffix!r}{hint}"
         )
     arrays = read_arrays(path)
     rotations, translations = read_poses(path, arrays)
-    z_up = Motion(rotations, translations, read_rate(path, arrays), path.stem)
-    return turn_motion(z_up, body, torch.tensor(_Y_UP_FROM_Z_UP))
+    told = Motion(rotations, translations, fps or read_rate(path, arrays), path.stem)
+    found = _up(up) or find_up(joint_places(body, told), "z")
+    _report(path, found, f"{told.fps:g} fps")
+    return told if found.axis == "y" else turn_motion(told, body, quarter_turn(found.axis))
+
+
+def _read_bvh(path: Path, body: Body, up: Up | None, fps: float | None) -> Motion:
+    """Return the motion of a .bvh on our body."""
+    recording = read_bvh(path, fps)
+    skeleton = recording.skeleton
+    turns, places = pose_skeleton(skeleton, recording.values)
+    bones = bones_of(turns, places, skeleton.parents)
+    figure = _figure(path, skeleton, bones, places)
+    joints = body_places(figure, places)
+    metres = float(leg_length(body.joints) / leg_length(joints).median())
+    found = _up(up) or find_up(metres * joints, "y")
+    rest = standing_rest(figure, bones, skeleton.parents)
+    turn = quarter_turn(found.axis).double()
+    tips = {joint: torch.tensor(tip, dtype=torch.float64) for joint, tip in skeleton.tips.items()}
+    clip = Clip(turn @ turns, places @ turn.T, tuple(skeleton.parents), tips, figure)
+    rests = "in no person's pose, so its joints are aligned by how they move"
+    if rest is not None:
+        rests = "standing" if torch.equal(rest, torch.eye(3).to(rest)) else "standing, turned"
+    _report(
+        path,
+        found,
+        f"{len(skeleton.names)} joints by their {figure.known_by}, rest {rests}, "
+        f"1 unit = {metres:.3g} m (legs), {recording.fps:.6g} fps",
+    )
+    return retarget(clip, rest, body, recording.fps, path.stem)
+
+
+def _figure(path: Path, skeleton: Skeleton, bones: Tensor, places: Tensor) -> Figure:
+    """Return the person in a skeleton, or raise."""
+    if not bones.any():
+        raise MotionError(
+            f"motion file {path}: all offsets are zero, so the file has no bones; export it with its skeleton"
+        )
+    figure = find_figure(skeleton.names, skeleton.parents, bones, places)
+    if isinstance(figure, list):
+        raise MotionError(
+            f"motion file {path}: lacks the joints {', '.join(figure)}; it has {', '.join(skeleton.names)}; "
+            "expected the names of CMU, Mixamo, LAFAN1, Rokoko or Xsens, or a person's shape; rename them"
+        )
+    joints = body_places(figure, places)
+    if not leg_length(joints).median() > 0:
+        raise MotionError(f"motion file {path}: its legs have no length; export it with its skeleton")
+    return figure
+
+
+def _up(told: Up | None) -> Uprightness | None:
+    return Uprightness(told, "told") if told else None
+
+
+def _report(path: Path, up: Uprightness, rest: str) -> None:
+    """Log what a file was taken for, in one line: a warning where that is doubtful."""
+    level = logging.INFO if up.sure else logging.WARNING
+    doubt = "" if up.sure else f"; if that is wrong, say --up {'z' if up.axis == 'y' else 'y'}"
+    LOGGER.log(level, "%s: %s up (%s%s), %s", path.name, up.axis.upper(), up.reason, doubt, rest)
 
 
 def write_motion(path: Path, motion: Motion, body: Body) -> None:
@@ -58,7 +130,7 @@ def write_motion(path: Path, motion: Motion, body: Body) -> None:
         motion: in the Y-up world.
         body: the body that moves.
     """
-    z_up = turn_motion(motion, body, torch.tensor(_Y_UP_FROM_Z_UP).T)
+    z_up = turn_motion(motion, body, quarter_turn("z").T)
     temporary = path.with_name(f".{path.stem}.tmp.npz")
     np.savez_compressed(
         temporary,
@@ -87,10 +159,13 @@ def turn_motion(motion: Motion, body: Body, rotation: Float[Tensor, "3 3"]) -> M
 def resample(motion: Motion, fps: float) -> Motion:
     """Return a motion at another frame rate, from its first frame to at most its last.
 
-    Rotations go from key to key at constant angular velocity (slerp), translations in a line.
+    Rotations go from key to key at constant angular velocity (slerp), translations in a line. A rate that
+    means the same (`same_rate`) changes no frame.
     """
     if not 0 < fps < float("inf"):
         raise MotionError(f"motion {motion.name}: cannot be resampled to {fps} frames per second")
+    if same_rate(motion.fps, fps):
+        return dataclasses.replace(motion, fps=fps)
     last, step = len(motion) - 1, motion.fps / fps
     # A millionth of a frame forgives the rounding of e.g. 29.97 / 119.88.
     times = torch.arange(int(last / step + 1e-6) + 1, dtype=torch.float64) * step

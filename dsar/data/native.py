@@ -195,7 +195,7 @@ def _read_camera(entry: Mapping[str, Any], where: str) -> Camera:
 def _read_sequence_motion(root: Path, name: str, entry: Mapping[str, Any], body: Body, fps: float) -> Motion:
     where = f"{root / RECORD_NAME}, sequence {name}"
     path = root / _get(entry, "motion", str, where)
-    motion, frames = read_motion(path, body), _get(entry, "frames", int, where)
+    motion, frames = read_motion(path, body, up="z"), _get(entry, "frames", int, where)
     if len(motion) != frames or motion.fps != fps:
         raise CaptureError(
             f"{where}: expected {frames} frames at {fps:g} a second, found {len(motion)} at {motion.fps:g} "

@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dsar.body.skinning import forward_kinematics
 from dsar.data.divergence import FAR, NEAR, divergence
+from dsar.data.orientation import joint_places
 from dsar.types import Body, Motion
 
 USUAL = 0.999
@@ -19,9 +19,7 @@ LOGGER = logging.getLogger(__name__)
 
 def joint_speeds(body: Body, motion: Motion) -> Float[Tensor, " f"]:
     """Return how fast the fastest joint moves from each frame to the next, metres a second."""
-    transforms = forward_kinematics(body, motion.rotations, motion.translations)
-    joints = (transforms[..., :3, :3] @ body.joints[:, :, None])[..., 0] + transforms[..., :3, 3]
-    return joints.diff(dim=0).norm(dim=-1).amax(1) * motion.fps
+    return joint_places(body, motion).diff(dim=0).norm(dim=-1).amax(1) * motion.fps
 
 
 def unusual_frames(body: Body, motion: Motion, known: Iterable[Motion]) -> tuple[list[int], float]:

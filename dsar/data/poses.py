@@ -1,9 +1,12 @@
 """SMPL-X poses as files hold them: `poses`, or its parts under AMASS's or SMPL-X's names."""
 
+import logging
+import struct
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 import torch
@@ -41,6 +44,20 @@ _ROOT_KEYS, _BODY_KEYS = ("root_orient", "global_orient"), ("pose_body", "body_p
 _TRANSLATION_KEYS = ("trans", "transl")
 _RATE_KEYS = ("mocap_frame_rate", "mocap_framerate", "fps")
 
+# What files under the name .npz really are, by their first bytes.
+_FOREIGN = {b"\x93NUMPY": "a single .npy array", b"\x80": "a pickle", b"HIERAR": "a .bvh", b"\x89HDF": "HDF5"}
+_DAMAGE = (
+    *(ValueError, EOFError, KeyError, NotImplementedError, RuntimeError, MemoryError, OverflowError),
+    *(TypeError, struct.error, zipfile.BadZipFile, zlib.error),
+)
+"""What NumPy and zipfile raise for damaged and foreign files."""
+_OTHER_ROTATIONS = {4: "quaternions", 6: "six-dimensional rotations", 9: "rotation matrices"}
+"""By how many numbers a joint has."""
+_SMPL_BODY = 69
+"""Columns of SMPL's body without its root: the last two joints are hands as lumps."""
+_HAND_KEYS, _MOST_COMPONENTS = ("left_hand_pose", "right_hand_pose"), 24
+LOGGER = logging.getLogger(__name__)
+
 
 def read_arrays(path: Path, *also: str) -> dict[str, np.ndarray]:
     """Return the arrays of a motion file that we use, and others by name, as float64; the rest is not opened.
@@ -51,13 +68,23 @@ def read_arrays(path: Path, *also: str) -> dict[str, np.ndarray]:
     if not path.is_file():
         raise MotionError(f"motion file {path}: no such file")
     used = ("poses", *_JOINTS_OF_KEY, *_TRANSLATION_KEYS, *_RATE_KEYS, *also)
-    try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-            arrays = {key: np.atleast_1d(file[key]).astype(np.float64) for key in used if key in file.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-        raise MotionError(
-            f"motion file {path}: cannot be read ({error}); expected arrays of numbers"
-        ) from error
+    with path.open("rb") as stream:
+        if not zipfile.is_zipfile(stream):
+            raise MotionError(f"motion file {path}: cannot be read: {_what_instead(stream)}")
+        stream.seek(0)
+        arrays = {}
+        try:
+            with np.load(stream, allow_pickle=False) as file:
+                for key in used:
+                    if key in file.files:
+                        arrays[key] = np.atleast_1d(file[key]).astype(np.float64)
+        except _DAMAGE as error:
+            reason = str(error) or type(error).__name__
+            if "allow_pickle" in reason:
+                reason = "it holds Python objects, which could run code; save plain arrays"
+            raise MotionError(
+                f"motion file {path}: cannot be read ({reason}); expected arrays of numbers"
+            ) from error
     for key, array in arrays.items():
         bad = np.argwhere(~np.isfinite(array))
         if len(bad):
@@ -81,7 +108,8 @@ def read_poses(
         MotionError: something is missing, there are no frames, or lengths disagree.
     """
     rotations = _read_rotations(path, arrays)
-    translations = arrays[_one_key(path, arrays, _TRANSLATION_KEYS)]
+    key = _one_key(path, arrays, _TRANSLATION_KEYS)
+    translations = _by_frame(path, key, arrays[key], [3])
     if translations.shape != (len(rotations), 3):
         expected = (len(rotations), 3)
         raise MotionError(f"motion file {path}: trans has shape {translations.shape}, expected {expected}")
@@ -90,39 +118,99 @@ def read_poses(
 
 def read_rate(path: Path, arrays: Mapping[str, np.ndarray]) -> float:
     """Return the frames per second that a file says it has, under any of the names in use."""
-    rate = arrays[_one_key(path, arrays, _RATE_KEYS)]
+    key = next((key for key in _RATE_KEYS if key in arrays), None)
+    if key is None:
+        raise MotionError(
+            f"motion file {path}: lacks {' or '.join(_RATE_KEYS)}, so its frame rate is unknown; say it with "
+            "--motion-fps"
+        )
+    rate = arrays[key]
     if rate.size != 1 or not rate.item() > 0:
-        raise MotionError(f"motion file {path}: the frame rate is {rate}, expected one number above 0")
+        raise MotionError(
+            f"motion file {path}: the frame rate is {rate}, expected one number above 0; say it "
+            "with --motion-fps"
+        )
     return rate.item()
 
 
 def _read_rotations(path: Path, arrays: Mapping[str, np.ndarray]) -> Float[np.ndarray, "f 55 3"]:
     """Return the rotations in SMPL-X's order, zero where the file has none."""
     if "poses" in arrays:
-        poses = arrays["poses"]
-        if poses.ndim != 2 or poses.shape[1] not in _JOINTS_OF_COLUMNS:
-            raise MotionError(
-                f"motion file {path}: poses has shape {poses.shape}, expected (frames, "
-                f"{' | '.join(map(str, _JOINTS_OF_COLUMNS))}) of axis-angles"
-            )
+        poses = _by_frame(path, "poses", arrays["poses"], [*_JOINTS_OF_COLUMNS])
         joints = _JOINTS_OF_COLUMNS[poses.shape[1]]
         parts = [("poses", joints, poses[:, : 3 * len(joints)])]
     else:
         for keys in (_ROOT_KEYS, _BODY_KEYS):
             _one_key(path, arrays, keys, instead="poses")
-        parts = [(key, [*joints], arrays[key]) for key, joints in _JOINTS_OF_KEY.items() if key in arrays]
-    frames = min(len(values) for _, _, values in parts)
+        parts = []
+        for key, joints in _JOINTS_OF_KEY.items():
+            if key in arrays and not _is_compressed(path, key, arrays[key]):
+                columns = [3 * len(joints), *([_SMPL_BODY] if key in _BODY_KEYS else [])]
+                values = _by_frame(path, key, arrays[key], columns)
+                parts.append((key, [*joints], values[:, : columns[0]]))
+    frames = len(parts[0][2])
     if frames == 0:
         raise MotionError(f"motion file {path}: has no frames")
     rotations = np.zeros((frames, len(JOINT_NAMES), 3))
     for key, joints, values in parts:
-        found, expected = (len(values), values[0].size), (frames, 3 * len(joints))
-        if found != expected:
+        if len(values) != frames:
             raise MotionError(
-                f"motion file {path}: {key} has {found} values, expected {expected} axis-angles"
+                f"motion file {path}: {key} has {len(values)} frames, expected {frames} as {parts[0][0]}"
             )
         rotations[:, joints] = values.reshape(frames, -1, 3)
+    _check_radians(path, rotations)
     return rotations
+
+
+def _by_frame(path: Path, key: str, values: np.ndarray, columns: Sequence[int]) -> Float[np.ndarray, "f c"]:
+    """Return a row a frame, from any arrangement of values that has one meaning, or raise."""
+    *leading, last = values.shape
+    frames = sum(size != 1 for size in leading)
+    if last in columns and frames <= 1:
+        return values.reshape(-1, last)
+    if last == 3 and leading and 3 * leading[-1] in columns and frames - (leading[-1] != 1) <= 1:
+        return values.reshape(-1, 3 * leading[-1])
+    if len(leading) == 1 and leading[0] in columns:
+        LOGGER.info("%s: %s is %d x %d, a frame a column: transposed", path.name, key, *values.shape)
+        return values.T
+    kind = next(
+        (name for size, name in _OTHER_ROTATIONS.items() if 3 * last in [size * c for c in columns]), None
+    )
+    if len(leading) > 1:
+        kind = _OTHER_ROTATIONS.get(9 if values.shape[-2:] == (3, 3) else last)
+    hint = f": {kind}, it seems; convert them" if kind else ""
+    expected = f"(frames, {' | '.join(map(str, columns))})"
+    expected += "" if key in _TRANSLATION_KEYS else " of axis-angles"
+    raise MotionError(f"motion file {path}: {key} has shape {values.shape}, expected {expected}{hint}")
+
+
+def _is_compressed(path: Path, key: str, values: np.ndarray) -> bool:
+    """Whether a hand's pose is given by principal components; say so."""
+    compressed = key in _HAND_KEYS and values.shape[-1] <= _MOST_COMPONENTS
+    if compressed:
+        LOGGER.warning("%s: %s is given by principal components: hands stay at rest", path.name, key)
+    return compressed
+
+
+def _check_radians(path: Path, rotations: Float[np.ndarray, "f 55 3"]) -> None:
+    """Raise where the angles of knees, elbows and their like go beyond a full turn in most frames."""
+    largest = np.median(np.linalg.norm(rotations[:, 1 : FACE_JOINTS.start], axis=2).max(axis=1))
+    if largest > 1.2 * 2 * np.pi:
+        raise MotionError(
+            f"motion file {path}: in most frames a joint turns by {largest:.0f} radians; the poses are in "
+            "degrees, it seems: convert them with numpy.deg2rad"
+        )
+
+
+def _what_instead(stream: BinaryIO) -> str:
+    """Return what a file is that is no zip archive, as .npz are."""
+    stream.seek(0)
+    start = stream.read(8)
+    if start.startswith(b"PK"):
+        return "it is cut, its end is missing; copy it again"
+    found = next((kind for mark, kind in _FOREIGN.items() if start.startswith(mark)), "no .npz archive")
+    what = found if start else "empty"
+    return f"it is {what}; save poses, trans and mocap_frame_rate with numpy.savez"
 
 
 def _one_key(path: Path, arrays: Mapping[str, np.ndarray], keys: tuple[str, ...], instead: str = "") -> str:

@@ -16,6 +16,7 @@ from dsar.data.divergence import label_sequences
 from dsar.data.frames import parse_range
 from dsar.data.motion import turn_motion
 from dsar.data.multiview import MultiViewCapture, Views
+from dsar.data.orientation import quarter_turn
 from dsar.errors import CaptureError
 from dsar.geometry.rotations import matrix_from_axis_angle
 from dsar.types import Body, Camera, Motion
@@ -181,14 +182,7 @@ def upright(name: str, motions: Sequence[Motion]) -> Float[Tensor, "3 3"]:
             f"capture {name}: which way is up? On average the body's spine points along {up.tolist()}, along "
             "no axis of the calibration's world; turn calibration and motion so that Y is up"
         )
-    sign = float(up[axis].sign())
-    if axis == 1:
-        return torch.diag(torch.tensor([1.0, sign, sign]))
-    turn = torch.zeros(3, 3)
-    turn[1, axis], turn[axis, 1] = sign, -sign
-    other = 3 - 1 - axis
-    turn[other, other] = 1.0
-    return turn
+    return quarter_turn(("-" if up[axis] < 0 else "") + "xyz"[axis])
 
 
 def turn_camera(camera: Camera, turn: Float[Tensor, "3 3"]) -> Camera:

@@ -1,5 +1,7 @@
 """Motion capture on CMU's skeleton moves our body: limbs point where the clip's do."""
 
+import re
+
 import numpy as np
 import pytest
 import torch
@@ -8,7 +10,6 @@ from scipy.spatial.transform import Rotation
 from dsar.body.files import load_body
 from dsar.body.model import JOINT_NAMES
 from dsar.body.skinning import forward_kinematics
-from dsar.data.bvh import COUNTERPARTS
 from dsar.data.motion import read_motion
 from dsar.errors import MotionError
 
@@ -36,6 +37,15 @@ LIMBS = [
     for side in ("left", "right")
     for start, end in (("hip", "knee"), ("knee", "ankle"), ("shoulder", "elbow"), ("elbow", "wrist"))
 ]
+WORDS = {
+    "hip": "UpLeg",
+    "knee": "Leg",
+    "ankle": "Foot",
+    "shoulder": "Arm",
+    "elbow": "ForeArm",
+    "wrist": "Hand",
+}
+COUNTERPARTS = {f"{s}_{our}": s.capitalize() + word for s in ("left", "right") for our, word in WORDS.items()}
 
 
 def write_bvh(path, frames, positions, angles, *, names=None, seconds="0.0083333"):
@@ -139,10 +149,17 @@ def test_world_rotations_do_not_depend_on_the_bodys_rest_arms(tmp_path, clip):
     [
         ("MOTION", "", "has no MOTION"),
         ("Frames: 6", "Frames: 7", "has 6 frames, expected 7"),
+        ("Frames: 6", "Frames: -6", "has 6 frames, expected -6"),
+        ("0.0083333", "30", "frame time 30 .* below one second; say its frames per second with --motion-fps"),
+        ("CHANNELS 3 Z", "CHANNELS 2 Z", "joint LHipJoint announces 2 channels and names 3"),
+        ("CHANNELS 3 Zrotation", "CHANNELS 3 Zrotating", "LHipJoint has channels Zrotating"),
+        ("CHANNELS 3 Zrotation", "CHANNELS 3 Xrotation", "LHipJoint has .* expected each axis once"),
+        ("}\nMOTION", "MOTION", "the brace of the joint Hips is not closed"),
+        ("}\nMOTION", "}\n}\nMOTION", "a brace too many is closed"),
+        ("JOINT LHipJoint", "ROOT LHipJoint", "several roots, Hips and LHipJoint"),
         ("Frames: 6", "Frames: x", "cannot be read as .bvh"),
         ("0.0083333", "0", "not a finite number above"),
         ("OFFSET 0 2.1 0\n", "OFFSET 0 2.1\n", "OFFSET of three numbers"),
-        ("JOINT LeftLeg", "JOINT LeftShin", "lacks the joints LeftLeg; it has Hips"),
         ("Xposition Yposition Zposition", "Xscale Yscale Zscale", "its root has no position"),
     ],
 )
@@ -168,3 +185,95 @@ def test_a_short_line_and_a_value_that_is_not_finite_are_refused_with_their_fram
             read_motion(path, load_body())
     with pytest.raises(MotionError, match="no such file"):
         read_motion(tmp_path / "none.bvh", load_body())
+
+
+ENCODINGS = {
+    "byte-order mark and CRLF": lambda text: b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode(),
+    "UTF-16": lambda text: text.encode("utf-16"),
+    "CR alone": lambda text: text.replace("\n", "\r").encode(),
+    "Latin-1 names": lambda text: text.replace("LHipJoint", "Hüfte").encode("latin-1"),
+    "braces behind names": lambda text: re.sub(r"\n\s*{", " {", text).encode(),
+    "small letters": lambda text: text.replace("JOINT", "joint").replace("CHANNELS", "Channels").encode(),
+    "a prefix": lambda text: re.sub("(ROOT|JOINT) ", r"\1 Müller:", text).encode(),
+}
+
+
+@pytest.mark.parametrize("how", ENCODINGS)
+def test_encodings_and_line_ends_do_not_change_a_motion(tmp_path, clip, how):
+    plain = write_bvh(tmp_path / "plain.bvh", 6, *clip)
+    other = tmp_path / "Größe 動き.BVH"
+    other.write_bytes(ENCODINGS[how](plain.read_text()))
+    expected, motion = (read_motion(path, load_body()) for path in (plain, other))
+    assert torch.equal(motion.rotations, expected.rotations)
+    assert torch.equal(motion.translations, expected.translations)
+
+
+def test_a_skeleton_without_bones_is_refused_and_one_with_them_in_its_channels_is_not(tmp_path, clip):
+    """Positions of all joints by frame, in place of OFFSETs that are zero."""
+    plain = write_bvh(tmp_path / "plain.bvh", 6, *clip)
+    lines, values = plain.read_text().split("MOTION")
+    offsets = re.findall(r"OFFSET (.*)\n\s*CHANNELS", lines)
+    empty = re.sub(r"OFFSET .*(\n\s*CHANNELS)", r"OFFSET 0 0 0\1", lines)
+    path = tmp_path / "bones.bvh"
+    path.write_text(empty + "MOTION" + values)
+    with pytest.raises(MotionError, match=r"bones\.bvh: all offsets are zero, so the file has no bones"):
+        read_motion(path, load_body())
+    empty = empty.replace("CHANNELS 3 ", "CHANNELS 6 Xposition Yposition Zposition ")
+    head, *rows = values.strip().split("\n")[0:1], *values.strip().split("\n")[2:]
+    moved = []
+    for row in rows:
+        numbers = row.split()
+        joints = [numbers[3 * joint + 3 : 3 * joint + 6] for joint in range(len(offsets))]
+        places = [" ".join(numbers[:3]), *offsets[1:]]
+        moved.append(
+            " ".join(f"{place} {' '.join(turn)}" for place, turn in zip(places, joints, strict=True))
+        )
+    path.write_text(empty + "MOTION\n" + head[0] + "\nFrame Time: .0083333\n" + "\n".join(moved))
+    motion, expected = (read_motion(each, load_body()) for each in (path, plain))
+    assert torch.allclose(motion.rotations, expected.rotations, atol=1e-5)
+    assert torch.allclose(motion.translations, expected.translations, atol=1e-5)
+
+
+def test_scales_are_left_out_where_they_are_constant_and_refused_where_they_change(tmp_path, clip, caplog):
+    plain = write_bvh(tmp_path / "plain.bvh", 6, *clip)
+    *lines, last = plain.read_text().replace("CHANNELS 6 Xpos", "CHANNELS 7 Xscale Xpos").splitlines()
+    path = tmp_path / "scaled.bvh"
+    frames = [*lines[-5:], last]
+    path.write_text("\n".join([*lines[:-5], *(f"1.0 {frame}" for frame in frames)]))
+    expected = read_motion(plain, load_body())
+    assert torch.equal(read_motion(path, load_body()).rotations, expected.rotations)
+    assert "1 scale channels, all constant, are left out" in caplog.text
+    path.write_text("\n".join([*lines[:-5], *(f"{number}.0 {frame}" for number, frame in enumerate(frames))]))
+    with pytest.raises(MotionError, match="joints change their scale"):
+        read_motion(path, load_body())
+
+
+def test_frames_beyond_those_announced_are_left_out_and_said(tmp_path, clip, caplog):
+    path = write_bvh(tmp_path / "long.bvh", 6, *clip)
+    path.write_text(path.read_text().replace("Frames: 6", "Frames: 5"))
+    assert len(read_motion(path, load_body())) == 5
+    assert "announces 5 frames and has 6; the last are left out" in caplog.text
+
+
+def test_a_rest_pose_with_splayed_legs_in_front_of_a_recording_is_left_out(tmp_path, clip):
+    """CMU's T-pose turns legs and arms a little and nothing else."""
+    positions, angles = clip
+    angles[0] = 0.0
+    angles[0, 3, 0], angles[0, 4, 0] = -17.0, 17.0
+    assert len(read_motion(write_bvh(tmp_path / "clip.bvh", 6, positions, angles), load_body())) == 5
+
+
+@pytest.mark.parametrize(
+    ("seconds", "fps"),
+    [
+        (".0083333", 120.0),
+        ("0.0333667", 30000 / 1001),
+        ("0.041708", 24000 / 1001),
+        ("0.041667", 24.0),
+        ("0.01", 100.0),
+    ],
+)
+def test_the_time_of_a_frame_in_few_digits_is_the_rate_that_is_meant(tmp_path, clip, seconds, fps):
+    path = write_bvh(tmp_path / "clip.bvh", 6, *clip, seconds=seconds)
+    assert read_motion(path, load_body()).fps == fps
+    assert read_motion(path, load_body(), fps=50.0).fps == 50.0

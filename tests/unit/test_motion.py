@@ -1,5 +1,6 @@
 """Motion files: what is written is read back, Z-up files land Y-up, broken ones are refused."""
 
+import pickle
 from pathlib import Path
 
 import numpy as np
@@ -58,7 +59,7 @@ def test_written_motion_is_read_back(body: Body, tmp_path: Path) -> None:
 
 def test_z_up_file_poses_the_same_body_turned_y_up(body: Body, tmp_path: Path) -> None:
     arrays = amass()
-    motion = read_motion(write_npz(tmp_path / "m.npz", arrays), body)
+    motion = read_motion(write_npz(tmp_path / "m.npz", arrays), body, up="z")
     assert motion.fps == 120.0
     rotations = torch.from_numpy(arrays["poses"]).float().unflatten(1, (-1, 3))
     z_up = pose_vertices(body, Pose(rotations[2], torch.from_numpy(arrays["trans"][2]).float()))
@@ -123,6 +124,127 @@ def test_broken_file_is_refused_with_its_name_and_fault(
     with pytest.raises(MotionError, match=message) as error:
         read_motion(path, body)
     assert str(path) in str(error.value)
+
+
+def arrangements(poses: np.ndarray, trans: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    return {
+        "frames, joints, 3": (poses.reshape(len(poses), -1, 3), trans),
+        "a batch of one": (poses[None], trans[None]),
+        "a frame a column": (poses.T, trans.T),
+        "float32": (poses.astype(np.float32), trans.astype(np.float32)),
+    }
+
+
+@pytest.mark.parametrize("how", ["frames, joints, 3", "a batch of one", "a frame a column", "float32"])
+def test_any_arrangement_with_one_meaning_is_read(body: Body, tmp_path: Path, how: str) -> None:
+    arrays = amass(frames=7)
+    expected = read_motion(write_npz(tmp_path / "m.npz", arrays), body)
+    poses, trans = arrangements(arrays["poses"], arrays["trans"])[how]
+    motion = read_motion(write_npz(tmp_path / "m.NPZ.npz", arrays | {"poses": poses, "trans": trans}), body)
+    assert torch.equal(motion.rotations, expected.rotations)
+    assert torch.equal(motion.translations, expected.translations)
+
+
+def test_a_single_pose_is_a_motion_of_one_frame(body: Body, tmp_path: Path) -> None:
+    arrays = amass(frames=1)
+    expected = read_motion(write_npz(tmp_path / "m.npz", arrays), body)
+    single = arrays | {"poses": arrays["poses"][0], "trans": arrays["trans"][0]}
+    assert torch.equal(read_motion(write_npz(tmp_path / "m.npz", single), body).rotations, expected.rotations)
+
+
+def test_smpl_fits_in_parts_are_read_and_compressed_hands_stay_at_rest(
+    body: Body, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    arrays = amass(columns=72)
+    poses = arrays.pop("poses")
+    expected = read_motion(write_npz(tmp_path / "m.npz", {"poses": poses, **arrays}), body)
+    parts = {
+        "global_orient": poses[:, None, :3],
+        "body_pose": poses[:, 3:],
+        "left_hand_pose": np.ones((4, 12)),
+    }
+    motion = read_motion(write_npz(tmp_path / "m.npz", parts | arrays), body)
+    assert torch.equal(motion.rotations, expected.rotations)
+    assert "left_hand_pose is given by principal components: hands stay at rest" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("shape", "message"),
+    [
+        ((4, 220), "quaternions"),
+        ((4, 55, 4), "quaternions"),
+        ((4, 330), "six-dimensional"),
+        ((4, 22, 6), "six-dimensional"),
+        ((4, 55, 3, 3), "rotation matrices"),
+        ((2, 4, 165), r"expected \(frames, 165"),
+    ],
+)
+def test_other_rotations_and_several_people_are_refused_by_name(
+    body: Body, tmp_path: Path, shape: tuple[int, ...], message: str
+) -> None:
+    with pytest.raises(MotionError, match=message):
+        read_motion(write_npz(tmp_path / "m.npz", amass() | {"poses": np.ones(shape)}), body)
+
+
+def test_degrees_are_refused_by_name(body: Body, tmp_path: Path) -> None:
+    arrays = amass()
+    with pytest.raises(MotionError, match=r"turns by \d+ radians; the poses are in degrees"):
+        read_motion(write_npz(tmp_path / "m.npz", arrays | {"poses": np.rad2deg(arrays["poses"])}), body)
+
+
+def test_a_rate_that_a_file_lacks_can_be_told(body: Body, tmp_path: Path) -> None:
+    arrays = amass()
+    path = write_npz(tmp_path / "m.npz", {key: arrays[key] for key in ("poses", "trans")})
+    with pytest.raises(MotionError, match="its frame rate is unknown; say it with --motion-fps"):
+        read_motion(path, body)
+    assert read_motion(path, body, fps=25.0).fps == 25.0
+    assert read_motion(write_npz(path, arrays), body, fps=25.0).fps == 25.0
+    with pytest.raises(MotionError, match="--motion-fps 0, expected frames per second above 0"):
+        read_motion(path, body, fps=0.0)
+
+
+def test_foreign_files_under_the_name_npz_are_refused_for_what_they_are(body: Body, tmp_path: Path) -> None:
+    path = tmp_path / "m.npz"
+    with (tmp_path / "m.npy").open("wb") as stream:
+        np.save(stream, np.zeros((5, 165)))
+    whole = write_npz(tmp_path / "whole.npz", amass()).read_bytes()
+    contents = {
+        "it is a single .npy array": (tmp_path / "m.npy").read_bytes(),
+        "it is a pickle": pickle.dumps({"poses": 1}),
+        "it is a .bvh": b"HIERARCHY\nROOT Hips",
+        "it is empty": b"",
+        "it is no .npz archive": b"poses",
+        "it is cut, its end is missing": whole[:3],
+        "it is cut": whole[:-30],
+    }
+    for message, content in contents.items():
+        path.write_bytes(content)
+        with pytest.raises(MotionError, match=message):
+            read_motion(path, body)
+    np.savez(path, poses=np.array([{"a": 1}], dtype=object))
+    with pytest.raises(MotionError, match="holds Python objects, which could run code"):
+        read_motion(path, body)
+
+
+@pytest.mark.parametrize(("suffix", "hint"), [(".pkl", "as .npz"), (".PT", "as .npz"), (".fbx", r"as \.bvh")])
+def test_other_formats_are_refused_with_the_way_to_ours(
+    body: Body, tmp_path: Path, suffix: str, hint: str
+) -> None:
+    with pytest.raises(MotionError, match=hint):
+        read_motion(tmp_path / f"motion{suffix}", body)
+
+
+def test_a_suffix_in_capitals_and_letters_of_any_script_are_taken(body: Body, tmp_path: Path) -> None:
+    path = write_npz(tmp_path / "m.npz", amass()).rename(tmp_path / "Größe und 動き.NPZ")
+    assert read_motion(path, body).name == "Größe und 動き"
+
+
+def test_resampling_to_a_rate_that_means_the_same_changes_no_frame() -> None:
+    motion = random_motion(9, fps=30000 / 1001)
+    same = resample(motion, 29.97)
+    assert same.fps == 29.97
+    assert torch.equal(same.rotations, motion.rotations)
+    assert len(resample(random_motion(9, fps=24.0), 24000 / 1001)) == 8
 
 
 def test_missing_foreign_and_truncated_files_are_refused(body: Body, tmp_path: Path) -> None:
