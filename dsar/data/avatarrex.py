@@ -116,7 +116,9 @@ def _read_calibration(where: Path, root: Path, views: Mapping[str, str]) -> tupl
         folders[camera.name] = check_name(at, name)
         distortion[camera.name] = check_distortion(at, entry.get("distCoeff") or ())
     if not cameras or len(folders) != len(cameras):
-        raise CaptureError(f"{where}: expected cameras whose names differ, found {list(record)}")
+        raise CaptureError(
+            f"{where}: expected cameras whose names differ in letters and digits, found {list(record)}"
+        )
     lists = [
         read_missing(find_file(root, name)) for name in ("missing_img_files.txt", "missing_msk_files.txt")
     ]

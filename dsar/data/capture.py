@@ -64,7 +64,7 @@ def open_capture(
         MotionError: Its motion is.
         BodyError: The body file is.
     """
-    root = EMBEDDED_CAPTURE if source == "embedded" else Path(source).resolve()
+    root = EMBEDDED_CAPTURE if source == "embedded" else Path(source).expanduser().resolve()
     if not root.is_dir():
         raise CaptureError(f"capture {root}: no such folder; give a capture folder or `embedded`")
     opening = Opening(None if body is None else Path(body), train_frames, test_frames)

@@ -203,7 +203,11 @@ def read_levels(image: Image.Image, where: str) -> Levels:
         raise CaptureError(f"mask {where}: all its palette's entries have one colour; save it as grey")
     if alpha.min() == alpha.max() and (alpha[0, 0] == 255 or not plain):
         return _of_color(color, where)
-    if not plain and _is_grey(color) and np.abs(color[..., 0].astype(int) - alpha).mean() > 1:
+    if (
+        not plain
+        and bool((color == color[..., :1]).all())
+        and np.abs(color[..., 0].astype(int) - alpha).mean() > 1
+    ):
         raise CaptureError(
             f"mask {where}: its grey and its alpha differ, and either may be the mask; save that one as grey"
         )
@@ -212,28 +216,22 @@ def read_levels(image: Image.Image, where: str) -> Levels:
 
 def _of_color(color: UInt8[np.ndarray, "h w 3"], where: str) -> Levels:
     """Return the levels of a mask that was saved with colours: grey ones, or one colour on black."""
-    if _is_grey(color):
-        return Levels(np.ascontiguousarray(color[..., 0]), ())
-    packed = (color.astype(np.uint32) * np.array([1 << 16, 1 << 8, 1], np.uint32)).sum(-1)
-    colors = np.unique(packed)
-    if len(colors) != 2 or colors[0] != 0:
-        count = f"{len(colors)} colours" if len(colors) < 100 else "the colours of a photograph"
-        raise CaptureError(
-            f"mask {where}: is no mask: its channels differ, it has {count}; save the person as white, the "
-            "rest as black"
-        )
-    value = f"#{colors[1]:06x}"
-    return Levels(
-        np.where(packed > 0, np.uint8(255), np.uint8(0)),
-        (Note(f"are {value} on black: {value} is the person"),),
-    )
-
-
-def _is_grey(color: UInt8[np.ndarray, "h w 3"]) -> bool:
     if (color[..., 1:] == color[..., :1]).all():
-        return True
+        return Levels(np.ascontiguousarray(color[..., 0]), ())
+    packed = (color * np.array([1 << 16, 1 << 8, 1], np.uint32)).sum(-1, dtype=np.uint32)
+    person = packed > 0
+    value = int(packed.max())
+    if not person.all() and (packed[person] == value).all():
+        note = Note(f"are #{value:06x} on black: #{value:06x} is the person")
+        return Levels(np.where(person, np.uint8(255), np.uint8(0)), (note,))
+    # JPEG sets the channels of grey pixels apart.
     spread = color.max(-1) - color.min(-1)
-    return bool((spread > _ROUGH).mean() <= _FEW and np.median(spread) <= 2)
+    if (spread > _ROUGH).mean() <= _FEW and np.median(spread) <= 2:
+        return Levels(np.ascontiguousarray(color[..., 0]), ())
+    raise CaptureError(
+        f"mask {where}: is no mask: its channels differ, and it has {len(np.unique(packed))} colours; save "
+        "the person as white, the rest as black"
+    )
 
 
 def _orientation(image: Image.Image) -> int:

@@ -4,8 +4,8 @@ from pathlib import Path
 
 _HEAD = 512
 _TIFF = (
-    "a TIFF of a kind that Pillow does not read, such as RGB of 16 bits or a raw photograph: save it with 8 "
-    "bits, as PNG or JPEG"
+    "a TIFF of a kind that Pillow does not read, such as floating-point RGB or a raw photograph: save it "
+    "with 8 bits, as PNG or JPEG"
 )
 _SIGNS = (
     (b"version https://git-lfs", "a Git LFS pointer: fetch the real file with `git lfs pull`"),

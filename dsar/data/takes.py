@@ -92,7 +92,10 @@ def make_capture(
     """
     names = [camera.name for camera in cameras]
     if len(set(names)) != len(names):
-        raise CaptureError(f"capture {root}: expected cameras whose names differ, found {', '.join(names)}")
+        raise CaptureError(
+            f"capture {root}: expected cameras whose names differ in letters and digits, found "
+            f"{', '.join(names)}"
+        )
     body, path = fitted_body(str(root), opening.body, betas, gender)
     turn = upright(str(root), [take.motion for take in takes])
     cameras = [turn_camera(camera, turn) for camera in cameras]

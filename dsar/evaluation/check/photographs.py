@@ -1,4 +1,4 @@
-"""Whether photographs fit their masks: a mask's edge should lie where the photograph has one."""
+"""Whether photographs fit their masks: person and surroundings differ in colour, where the mask says so."""
 
 from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -17,10 +17,12 @@ _TURNS: Mapping[str, Callable[[np.ndarray], np.ndarray]] = {
 }
 _FEWEST = 3
 """Views of a camera from which it can be judged."""
-_CLEARER, _SURER = 0.1, 4.0
+_CLEARER, _SURER = 0.08, 2.5
 """By how much, and by how many standard errors, a turned mask must fit better."""
-_FITTING = 0.7
-"""How well it must fit: 0.5 is chance, 1 the sharpest edges of the image."""
+_FITTING = 0.2
+"""How well it must fit."""
+_LEVELS = 6
+"""Of each channel that are told apart."""
 
 
 @dataclass(frozen=True)
@@ -32,9 +34,9 @@ class Misfit:
     how: str
     """What the photographs are, in words that follow `are`."""
     before: float
-    """How well masks fit as they are: 0.5 is chance, 1 the sharpest edges of the images."""
+    """Share of the masks that the photographs' colours tell."""
     after: float
-    """How well they would."""
+    """Share that they would tell."""
 
 
 def find_misfits(capture: MultiViewCapture, usable: Collection[tuple[str, int, int]]) -> list[Misfit]:
@@ -63,17 +65,21 @@ def find_misfits(capture: MultiViewCapture, usable: Collection[tuple[str, int, i
 
 
 def fits(color: Float[np.ndarray, "h w 3"], alpha: Float[np.ndarray, "h w"]) -> list[float]:
-    """Return how sharp a photograph is along its mask's edge, by rank among all its pixels.
+    """Return how much of a mask a photograph's colours tell: mutual information by the mask's entropy.
 
-    First with the mask as it is, then as each of `_TURNS` would have it. 0.5 is chance, 1 the sharpest edges.
+    First of the mask as it is, then as each of `_TURNS` would have it; 0 is nothing, 1 all of it. Turning
+    keeps what both hold, so that chance is the same in all.
     """
-    edges, outline = _edges(color), _edges(alpha[..., None])
-    # Flat backgrounds are equal everywhere: their pixels share one rank.
-    levels, place, counts = np.unique(edges, return_inverse=True, return_counts=True)
-    assert len(levels) == len(counts)
-    ranks = ((np.cumsum(counts) - counts / 2) / edges.size)[place.reshape(edges.shape)]
-    weights = [outline, *(turn(outline) for turn in _TURNS.values())]
-    return [float((ranks * each).sum() / max(each.sum(), 1e-9)) for each in weights]
+    bins = ((color / 256 * _LEVELS).astype(int) * np.array([_LEVELS**2, _LEVELS, 1])).sum(-1).ravel()
+    counts = np.bincount(bins, minlength=_LEVELS**3)
+    used = counts > 0
+    entropy = max(float(_entropy(np.array([alpha.mean() / 255]))[0]), 1e-9)
+    shares = []
+    for mask in (alpha, *(turn(alpha) for turn in _TURNS.values())):
+        inside = np.bincount(bins, weights=mask.ravel() / 255, minlength=_LEVELS**3)
+        left = (counts[used] * _entropy(inside[used] / counts[used])).sum() / counts.sum()
+        shares.append(1 - float(left) / entropy)
+    return shares
 
 
 def _better(views: Float[np.ndarray, "v t"]) -> str | None:
@@ -88,10 +94,9 @@ def _better(views: Float[np.ndarray, "v t"]) -> str | None:
     return names[best - 1] if clear else None
 
 
-def _edges(image: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "h w"]:
-    """Return how much an image changes about each pixel."""
-    rows, columns = np.gradient(image, axis=(0, 1))
-    return np.sqrt((rows**2 + columns**2).sum(-1)).round(4)
+def _entropy(share: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    some = np.clip(share, 1e-12, 1 - 1e-12)
+    return -(some * np.log(some) + (1 - some) * np.log(1 - some))
 
 
 def _reduced(image: UInt8[np.ndarray, "h w 4"]) -> Float[np.ndarray, "y x 4"]:

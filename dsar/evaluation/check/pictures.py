@@ -76,8 +76,8 @@ def judge_colors(
             Finding(
                 "photographs_turned",
                 f"the photographs of {names} are {misfit.how} against their masks: bring both to what the "
-                "calibration was made with; mind EXIF orientation, which is followed here (the masks' edges "
-                f"lie on edges of rank {misfit.before:.2f}, turned on {misfit.after:.2f})",
+                "calibration was made with; mind EXIF orientation, which is followed here (colours tell "
+                f"{misfit.before:.0%} of the masks, of turned ones {misfit.after:.0%})",
                 True,
             )
         )

@@ -106,7 +106,7 @@ def check_capture(capture: MultiViewCapture, report: Reporter = lambda *_: None)
     readable = [picture for picture in pictures if picture.broken is None]
     if not readable:
         raise CaptureError(
-            f"capture {capture.name}: none of its {total} images can be used; the first: {pictures[0].broken}"
+            f"capture {capture.name}: none of its {total} images can be read; the first: {pictures[0].broken}"
         )
     findings += _judge_pictures(capture, pictures)
     figures["read_ms"] = 1e3 * (time.monotonic() - began) / total
