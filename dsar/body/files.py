@@ -84,9 +84,14 @@ def choose_body(path: Path | None, gender: str) -> Path | None:
         gender: `neutral`, `female` or `male`: which of a folder's files.
 
     Raises:
-        BodyError: the folder has no such file.
+        BodyError: the folder has no such file, or $DSAR_BODY names nothing.
     """
-    chosen = path or (Path(os.environ["DSAR_BODY"]) if os.environ.get("DSAR_BODY") else None)
+    named = os.environ.get("DSAR_BODY", "").strip()
+    chosen = path or (Path(named) if named else None)
+    # Shells leave the ~ of --body=~/x and of variables as it is.
+    chosen = chosen and chosen.expanduser()
+    if chosen and not path and not chosen.exists():
+        raise BodyError(f"$DSAR_BODY is {named!r}: no such file or folder; correct it, or give --body")
     if chosen is None or not chosen.is_dir():
         return chosen
     names = [f"SMPLX_{gender.upper()}{suffix}" for suffix in (".npz", ".pkl")]

@@ -6,7 +6,6 @@ shares of the image. Each has smpl_params.npz: neutral SMPL-X, hands as 45 numbe
 
 import csv
 import dataclasses
-import json
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -15,13 +14,17 @@ from typing import Any
 import torch
 
 from dsar.data.calibration import camera_name, make_camera, opencv_camera
+from dsar.data.conversions import Conversions
 from dsar.data.distortion import check_distortion
+from dsar.data.folders import check_name, find_file, list_folder, list_images
+from dsar.data.images import image_size
 from dsar.data.multiview import MultiViewCapture
-from dsar.data.photos import Photos, image_size, read_missing
+from dsar.data.photos import Photos, read_missing
 from dsar.data.poses import read_arrays, read_poses
 from dsar.data.takes import Opening, Take, make_capture
 from dsar.errors import CaptureError
 from dsar.geometry.rotations import matrix_from_axis_angle
+from dsar.text import read_json, read_text
 from dsar.types import Camera, Motion
 
 PARAMETERS = "smpl_params.npz"
@@ -36,29 +39,27 @@ def open_avatarrex(root: Path, opening: Opening) -> MultiViewCapture:
         BodyError: the user's body file is.
     """
     views = {"color": "{camera}/{frame:08d}.jpg", "mask": "{camera}/mask/pha/{frame:08d}.jpg"}
-    cameras, photos = _read_calibration(root / "calibration_full.json", root, views)
+    cameras, photos = _read_calibration(find_file(root, "calibration_full.json"), root, views)
     return _capture(root, cameras, photos, 30.0, opening, open_avatarrex)
 
 
 def open_thuman4(root: Path, opening: Opening) -> MultiViewCapture:
     """Return a capture in THuman4.0's layout (30 frames a second); raises as `open_avatarrex` does."""
     views = {"color": "images/{camera}/{frame:08d}.jpg", "mask": "masks/{camera}/{frame:08d}.jpg"}
-    cameras, photos = _read_calibration(root / "calibration.json", root, views)
+    cameras, photos = _read_calibration(find_file(root, "calibration.json"), root, views)
     return _capture(root, cameras, photos, 30.0, opening, open_thuman4)
 
 
 def open_actorshq(root: Path, opening: Opening) -> MultiViewCapture:
     """Return a capture in ActorsHQ's layout (25 frames a second); raises as `open_avatarrex` does."""
-    (where,) = sorted(root.glob("*x/calibration.csv"))[:1] or [root / "calibration.csv"]
+    where = actorshq_calibration(root) or root / "calibration.csv"
     cameras, folders = [], {}
     try:
-        with where.open(newline="", encoding="utf-8") as file:
-            rows = list(csv.DictReader(file))
-        for row in rows:
+        for row in csv.DictReader(read_text(where, CaptureError).splitlines()):
             camera = _read_row(f"{where}, camera {row['name']}", row)
             cameras.append(camera)
-            folders[camera.name] = row["name"]
-    except (OSError, UnicodeDecodeError, KeyError, TypeError, ValueError, csv.Error) as error:
+            folders[camera.name] = check_name(str(where), row["name"])
+    except (KeyError, TypeError, ValueError, csv.Error) as error:
         if isinstance(error, CaptureError):
             raise
         raise CaptureError(f"{where}: expected name,w,h,rx,ry,rz,tx,ty,tz,fx,fy,px,py ({error})") from error
@@ -68,8 +69,16 @@ def open_actorshq(root: Path, opening: Opening) -> MultiViewCapture:
         "masks/{camera}/{camera}_mask{frame:06d}.png",
         frames=(),
         folders=folders,
+        conversions=Conversions(root.name),
     )
     return _capture(root, cameras, photos, 25.0, opening, open_actorshq)
+
+
+def actorshq_calibration(root: Path) -> Path | None:
+    """Return the calibration of the first resolution that a folder has, or its own; None without one."""
+    folders = [folder for folder in list_folder(root) if folder.name.endswith("x")]
+    files = (find_file(folder, "calibration.csv") for folder in [*folders, root])
+    return next((file for file in files if file.is_file()), None)
 
 
 def _read_row(where: str, row: Mapping[str, str]) -> Camera:
@@ -104,11 +113,15 @@ def _read_calibration(where: Path, root: Path, views: Mapping[str, str]) -> tupl
             raise CaptureError(f"{at}: expected imgSize as [width, height], found {size}")
         camera = opencv_camera(at, name, entry["K"], entry["R"], entry["T"], (size[0], size[1]))
         cameras.append(camera)
-        folders[camera.name] = name
+        folders[camera.name] = check_name(at, name)
         distortion[camera.name] = check_distortion(at, entry.get("distCoeff") or ())
     if not cameras or len(folders) != len(cameras):
-        raise CaptureError(f"{where}: expected cameras whose names differ, found {list(record)}")
-    lists = [read_missing(root / name) for name in ("missing_img_files.txt", "missing_msk_files.txt")]
+        raise CaptureError(
+            f"{where}: expected cameras whose names differ in letters and digits, found {list(record)}"
+        )
+    lists = [
+        read_missing(find_file(root, name)) for name in ("missing_img_files.txt", "missing_msk_files.txt")
+    ]
     photos = Photos(
         root,
         views["color"],
@@ -117,21 +130,18 @@ def _read_calibration(where: Path, root: Path, views: Mapping[str, str]) -> tupl
         folders=folders,
         distortion=distortion,
         missing=lists[0] | lists[1],
+        conversions=Conversions(root.name),
     )
     return cameras, photos
 
 
 def _first_size(root: Path, pattern: str, camera: str) -> tuple[int, int]:
-    folder = (root / pattern.format(camera=camera, frame=0)).parent
-    first = min(folder.glob("*.jpg"), default=folder / "00000000.jpg")
-    return image_size(first)
+    first = root / pattern.format(camera=camera, frame=0)
+    return image_size(next(iter(list_images(first.parent)), first))
 
 
 def _read_json(where: Path) -> dict[str, Any]:
-    try:
-        record = json.loads(where.read_text())
-    except (OSError, ValueError) as error:
-        raise CaptureError(f"{where}: cannot be read as JSON ({error})") from error
+    record = read_json(where, CaptureError)
     if not isinstance(record, dict):
         raise CaptureError(f"{where}: expected cameras by name, found a {type(record).__name__}")
     return record
@@ -145,7 +155,7 @@ def _capture(
     opening: Opening,
     open_again: Callable[[Path, Opening], MultiViewCapture],
 ) -> MultiViewCapture:
-    path = root / PARAMETERS
+    path = find_file(root, PARAMETERS)
     arrays = read_arrays(path, "betas")
     rotations, translations = read_poses(path, arrays)
     betas = arrays.get("betas")

@@ -2,6 +2,7 @@
 
 import math
 import re
+import unicodedata
 from typing import Any
 
 import torch
@@ -86,8 +87,9 @@ def opencv_camera(where: str, name: str, K: Any, R: Any, T: Any, size: tuple[int
 
 
 def camera_name(name: str) -> str:
-    """Return a camera's name as an identifier: `0004` becomes `cam_0004`."""
-    plain = re.sub(r"\W", "_", name, flags=re.ASCII)
+    """Return a camera's name as an identifier: `0004` becomes `cam_0004`, `vorne 2` `vorne_2`."""
+    letters = (sign if sign.isascii() else f"u{ord(sign):04x}" for sign in unicodedata.normalize("NFC", name))
+    plain = re.sub(r"\W", "_", "".join(letters), flags=re.ASCII)
     return plain if plain.isidentifier() else f"cam_{plain}"
 
 

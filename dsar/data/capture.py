@@ -4,8 +4,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from dsar.config import TrainConfig
-from dsar.data.avatarrex import PARAMETERS, open_actorshq, open_avatarrex, open_thuman4
+from dsar.data.avatarrex import PARAMETERS, actorshq_calibration, open_actorshq, open_avatarrex, open_thuman4
 from dsar.data.dress import is_dress, open_dress
+from dsar.data.folders import find_file
 from dsar.data.multiview import MultiViewCapture
 from dsar.data.native import RECORD_NAME, open_native
 from dsar.data.takes import Opening
@@ -21,19 +22,19 @@ def _open_native(root: Path, opening: Opening) -> MultiViewCapture:
 
 FORMATS: dict[str, tuple[Callable[[Path], bool], Callable[[Path, Opening], MultiViewCapture]]] = {
     f"our own ({RECORD_NAME})": (
-        lambda root: (root / RECORD_NAME).is_file(),
+        lambda root: find_file(root, RECORD_NAME).is_file(),
         _open_native,
     ),
     f"AvatarReX (calibration_full.json, {PARAMETERS})": (
-        lambda root: (root / "calibration_full.json").is_file(),
+        lambda root: find_file(root, "calibration_full.json").is_file(),
         open_avatarrex,
     ),
     f"THuman4.0 (calibration.json, {PARAMETERS})": (
-        lambda root: (root / "calibration.json").is_file(),
+        lambda root: find_file(root, "calibration.json").is_file(),
         open_thuman4,
     ),
     f"ActorsHQ (4x/calibration.csv, {PARAMETERS})": (
-        lambda root: any(root.glob("*x/calibration.csv")) or (root / "calibration.csv").is_file(),
+        lambda root: actorshq_calibration(root) is not None,
         open_actorshq,
     ),
     "4D-DRESS (Take*/basic_info.pkl, Capture/cameras.pkl)": (is_dress, open_dress),
@@ -63,7 +64,7 @@ def open_capture(
         MotionError: Its motion is.
         BodyError: The body file is.
     """
-    root = EMBEDDED_CAPTURE if source == "embedded" else Path(source).resolve()
+    root = EMBEDDED_CAPTURE if source == "embedded" else Path(source).expanduser().resolve()
     if not root.is_dir():
         raise CaptureError(f"capture {root}: no such folder; give a capture folder or `embedded`")
     opening = Opening(None if body is None else Path(body), train_frames, test_frames)

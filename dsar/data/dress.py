@@ -25,8 +25,11 @@ from torch import Tensor
 from dsar.body.files import choose_body, load_hands
 from dsar.body.model import FACE_JOINTS, JOINT_NAMES
 from dsar.data.calibration import opencv_camera
+from dsar.data.conversions import Conversions
+from dsar.data.folders import check_name, list_folder, list_images
+from dsar.data.images import image_size
 from dsar.data.multiview import MultiViewCapture
-from dsar.data.photos import Photos, image_size
+from dsar.data.photos import Photos
 from dsar.data.scans import PhotosAndScans, Scans, virtual_cameras
 from dsar.data.takes import Opening, Take, make_capture, turn_camera, upright
 from dsar.errors import CaptureError, MotionError
@@ -53,7 +56,7 @@ LOGGER = logging.getLogger(__name__)
 
 def is_dress(root: Path) -> bool:
     """Return whether a folder holds takes of 4D-DRESS, or is one."""
-    return (root / _INFO).is_file() or any(root.glob(f"*/{_INFO}"))
+    return bool(_takes(root))
 
 
 def open_dress(root: Path, opening: Opening) -> MultiViewCapture:
@@ -66,11 +69,7 @@ def open_dress(root: Path, opening: Opening) -> MultiViewCapture:
         MotionError: a fit has the wrong length or values that are not finite.
         BodyError: the user's body file is not usable.
     """
-    folders = (
-        [root]
-        if (root / _INFO).is_file()
-        else sorted((path.parent for path in root.glob(f"*/{_INFO}")), key=_take_order)
-    )
+    folders = _takes(root)
     released, names = _read_cameras(folders[0])
     for folder in folders[1:]:
         if not _same_cameras(released, _read_cameras(folder)[0]):
@@ -95,7 +94,7 @@ def open_dress(root: Path, opening: Opening) -> MultiViewCapture:
         turn = upright(str(root), [motion for motion, _ in fits])
         ring = virtual_cameras([turn_camera(c, turn) for c in released], turn.numpy() @ scans[0].center)
         virtual = [turn_camera(camera, turn.T) for camera in ring]
-    takes = []
+    takes, conversions = [], Conversions(f"{root.parent.name}_{root.name}")
     for folder, scan, (motion, _) in zip(folders, scans, fits, strict=True):
         photos = Photos(
             folder / "Capture",
@@ -103,6 +102,7 @@ def open_dress(root: Path, opening: Opening) -> MultiViewCapture:
             "{camera}/masks/mask-f{frame}.png",
             frames=scan.frames,
             folders=names,
+            conversions=conversions,
         )
         views = PhotosAndScans(photos, scan, {camera.name: camera for camera in virtual})
         takes.append(Take(motion, views))
@@ -116,6 +116,12 @@ def open_dress(root: Path, opening: Opening) -> MultiViewCapture:
         betas=torch.stack([betas for _, betas in fits]).mean(0),
         gender=gender,
     )
+
+
+def _takes(root: Path) -> list[Path]:
+    """Return the takes' folders in order: the folder itself, or those in it."""
+    folders = [root] if (root / _INFO).is_file() else sorted(list_folder(root), key=_take_order)
+    return [folder for folder in folders if (folder / _INFO).is_file()]
 
 
 def _take_order(folder: Path) -> tuple[int, str]:
@@ -148,7 +154,9 @@ def _read_info(folder: Path) -> tuple[list[str], str | None]:
     if not frames:
         raise CaptureError(f"{folder / _INFO}: expected the names of frames as scan_frames, found none")
     gender = info.get("gender")
-    return [frame if len(frame) >= 5 else frame.zfill(5) for frame in frames], gender
+    for frame in frames:
+        check_name(str(folder / _INFO), frame)
+    return [frame.zfill(5) for frame in frames], gender
 
 
 def _read_cameras(folder: Path) -> tuple[list[Camera], dict[str, str]]:
@@ -162,7 +170,8 @@ def _read_cameras(folder: Path) -> tuple[list[Camera], dict[str, str]]:
         if extrinsics.shape not in ((3, 4), (4, 4)):
             raise CaptureError(f"{at}: expected extrinsics of 3x4, found {extrinsics.shape}")
         images = folder / "Capture" / str(name) / "images"
-        size = image_size(min(images.glob("*.png"), default=images / "capture-f00000.png"))
+        check_name(at, str(name))
+        size = image_size(next(iter(list_images(images)), images / "capture-f00000.png"))
         K = np.asarray(entry["intrinsics"], dtype=object).tolist()
         camera = opencv_camera(
             at, str(name), K, extrinsics[:3, :3].tolist(), extrinsics[:3, 3].tolist(), size

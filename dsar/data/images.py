@@ -1,96 +1,130 @@
 """Images on disk: decoded, checked against their camera, and kept while there is room."""
 
-import io
-import struct
 import threading
-import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import UInt8
-from PIL import Image
 
+from dsar.data.conversions import Note
+from dsar.data.pixels import (
+    Levels,
+    Photograph,
+    displayed_size,
+    judge_photograph,
+    judge_turn,
+    opened,
+    read_levels,
+    read_photograph,
+    upright,
+)
 from dsar.errors import CaptureError
 from dsar.types import Camera
 
-# What Pillow raises on damaged files of the formats that captures use.
-_DAMAGE = (
-    OSError,
-    SyntaxError,
-    ValueError,
-    EOFError,
-    LookupError,
-    OverflowError,
-    struct.error,
-    zlib.error,
-    Image.DecompressionBombError,
-    Image.DecompressionBombWarning,
-)
 ROOM = 1 << 28
 """Bytes of decoded images that a process keeps."""
 
 
-def decode_rgba(data: bytes | Path, camera: Camera, where: str) -> UInt8[np.ndarray, "h w 4"]:
-    """Return an image with its mask as alpha.
+def decode_photograph(data: bytes | Path, camera: Camera, where: str, mask: Path | None = None) -> Photograph:
+    """Return a photograph as sRGB of its camera's size.
 
     Args:
         data: The file, or what is in it.
         camera: Whose size it must have.
         where: Names it in errors.
+        mask: The file of its mask; None: its alpha is, and it must have one.
 
     Raises:
-        CaptureError: It cannot be decoded, or is not 8-bit RGBA of the camera's size.
+        CaptureError: It cannot be decoded, is of a kind that no photograph is, or has another size.
     """
-    image = _decode(data, camera, where)
-    if image.ndim != 3 or image.shape[2] != 4 or image.dtype != np.uint8:
-        raise CaptureError(
-            f"image {where}: expected 8-bit RGBA, found shape {image.shape} of {image.dtype}; the mask "
-            "belongs into the alpha channel"
+    with opened(data, where) as image:
+        _refuse_size(displayed_size(image), image.size, camera, where, "mask", mask)
+        turned = judge_turn(image, (camera.width, camera.height))
+        image = upright(image, (camera.width, camera.height))
+        found = read_photograph(image, where)
+        if mask is None and found.alpha is None:
+            raise CaptureError(_no_alpha(where, image.mode))
+    return Photograph(found.color, found.alpha, (*turned, *found.notes))
+
+
+def decode_mask(path: Path, camera: Camera, photograph: Path | None = None) -> Levels:
+    """Return a mask's numbers; their meaning is its camera's `Coding`.
+
+    Args:
+        path: The file.
+        camera: Whose size it must have.
+        photograph: What it is the mask of.
+
+    Raises:
+        CaptureError: It cannot be decoded, is no mask, or has another size.
+    """
+    with opened(path, str(path)) as image:
+        _refuse_size(displayed_size(image), image.size, camera, str(path), "photograph", photograph)
+        turned = judge_turn(image, (camera.width, camera.height))
+        image = upright(image, (camera.width, camera.height))
+        found = read_levels(image, str(path))
+    return Levels(found.values, (*turned, *found.notes))
+
+
+def judge_header(data: bytes | Path, camera: Camera, where: str, mask: Path | None = None) -> list[Note]:
+    """Return what `decode_photograph` will convert, or raise what it will, without reading all pixels."""
+    with opened(data, where) as image:
+        _refuse_size(displayed_size(image), image.size, camera, where, "mask", mask)
+        if mask is None and not image.has_transparency_data:
+            raise CaptureError(_no_alpha(where, image.mode))
+        return [*judge_turn(image, (camera.width, camera.height)), *judge_photograph(image, where)]
+
+
+def _refuse_size(
+    shown: tuple[int, int],
+    stored: tuple[int, int],
+    camera: Camera,
+    where: str,
+    kind: str,
+    other: Path | None,
+) -> None:
+    """Raise CaptureError unless an image has its camera's size, as viewers show it or as it is stored."""
+    size = camera.width, camera.height
+    if size in (shown, stored):
+        return
+    ratio = size[0] / shown[0]
+    if shown == size[::-1]:
+        hint = "; they are turned by a quarter: turn the images, or calibrate them as they are"
+    elif abs(shown[1] * ratio - size[1]) < max(1.0, ratio):
+        hint = (
+            f"; it is the same picture at {1 / ratio:.4g} times the size: give images of the calibration's "
+            f"size, or multiply the calibration's size and K's first two rows by {1 / ratio:.4g}"
         )
-    return image
+    else:
+        hint = "; it is another camera's, or was cut"
+    if other is not None:
+        hint += f" (its {kind} has {_size_in_words(other)})"
+    raise CaptureError(
+        f"image {where}: expected {size[0]}x{size[1]} pixels as camera {camera.name} says, found "
+        f"{shown[0]}x{shown[1]}{hint}"
+    )
 
 
-def decode_photo(color: Path, mask: Path, camera: Camera) -> UInt8[np.ndarray, "h w 4"]:
-    """Return a photograph with its mask from two files; a mask of several channels counts by its first.
-
-    Raises:
-        CaptureError: One cannot be decoded, is not 8-bit, or has not the camera's size.
-    """
-    rgba = np.empty((camera.height, camera.width, 4), np.uint8)
-    rgba[..., :3] = _channels(color, camera)[..., :3]
-    rgba[..., 3] = _channels(mask, camera)[..., 0]
-    return rgba
-
-
-def _channels(path: Path, camera: Camera) -> UInt8[np.ndarray, "h w c"]:
-    """Return an image of one channel, or of three and more."""
-    image = _decode(path, camera, str(path))
-    if image.dtype == np.bool_:
-        image = image * np.uint8(255)
-    if image.dtype != np.uint8:
-        raise CaptureError(f"image {path}: expected 8 bits a channel, found {image.dtype}")
-    image = image if image.ndim == 3 else image[..., None]
-    return image if image.shape[2] >= 3 else image[..., :1]
-
-
-def _decode(data: bytes | Path, camera: Camera, where: str) -> np.ndarray:
-    """Return an image as Pillow decodes it; one of another size is refused by its header."""
+def _size_in_words(path: Path) -> str:
     try:
-        with Image.open(io.BytesIO(data) if isinstance(data, bytes) else data) as image:
-            size, pixels = image.size, None
-            if size == (camera.width, camera.height):
-                # Numbers of a palette's entries are no colours.
-                pixels = np.asarray(image.convert("RGB") if image.mode == "P" else image)
-    except _DAMAGE as error:
-        raise CaptureError(f"image {where}: cannot be decoded ({error})") from error
-    if pixels is None:
-        raise CaptureError(
-            f"image {where}: expected {camera.width}x{camera.height} pixels as camera {camera.name} says, "
-            f"found {size[0]}x{size[1]}"
-        )
-    return pixels
+        return "{}x{}".format(*image_size(path))
+    except CaptureError:
+        return "none that can be read"
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Return the width and height of an image as viewers show it.
+
+    Raises:
+        CaptureError: it is not there or no image.
+    """
+    with opened(path, str(path)) as image:
+        return displayed_size(image)
+
+
+def _no_alpha(where: str, mode: str) -> str:
+    return f"image {where}: expected RGBA, found {mode}; the mask belongs into the alpha channel"
 
 
 class ImageCache:

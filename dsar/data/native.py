@@ -1,106 +1,32 @@
 """Captures in our own format: a folder with a capture.json (docs/capture-format.md)."""
 
-import io
-import json
 import logging
-import zipfile
-import zlib
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
 import torch
-from jaxtyping import UInt8
-from PIL import Image, UnidentifiedImageError
+from jaxtyping import Float
+from torch import Tensor
 
 from dsar.body.files import choose_body, load_body
 from dsar.data.calibration import make_camera
-from dsar.data.images import decode_rgba
+from dsar.data.conversions import Conversions
+from dsar.data.cutouts import Cutouts
+from dsar.data.folders import check_name, find_file, inside
 from dsar.data.motion import read_motion
 from dsar.data.multiview import MultiViewCapture, OneToMany
 from dsar.errors import CaptureError
+from dsar.geometry.rates import same_rate
+from dsar.text import read_json
 from dsar.types import Body, Camera, Motion
 
 RECORD_NAME = "capture.json"
 FORMAT, VERSION = "dsar-capture", 1
-_SUFFIXES = (".webp", ".png")
 T = TypeVar("T")
 LOGGER = logging.getLogger(__name__)
-
-
-class _Images:
-    """Images of one sequence, in a folder or a zip, as CAMERA/FRAME.webp or .png; implements `Views`."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        # A zip stays open and its images are read one by one: all of them may not fit in memory.
-        self.archive = None if path.is_dir() else _open_archive(path)
-        names = self.archive.namelist() if self.archive else map(self._relative, path.glob("*/*"))
-        self.names = frozenset(names)
-
-    def has(self, camera: Camera, frame: int) -> bool:
-        """Return whether there is such an image."""
-        return self._find(camera, frame) is not None
-
-    def read(self, camera: Camera, frame: int) -> UInt8[np.ndarray, "h w 4"]:
-        """Return a decoded image, or raise CaptureError."""
-        name = self._find(camera, frame)
-        if name is None:
-            raise CaptureError(f"images {self.path}: no {camera.name}/{frame:04d}.webp or .png")
-        return decode_rgba(self._load(name), camera, f"{name} in {self.path}")
-
-    def check(self, cameras: Sequence[Camera], frames: int) -> None:
-        """Raise CaptureError unless every camera has images, and the first of them the right size."""
-        for camera in cameras:
-            there = [frame for frame in range(frames) if self.has(camera, frame)]
-            if not there:
-                raise CaptureError(
-                    f"images {self.path}: {camera.name} has none of {frames} frames; expected "
-                    f"{camera.name}/0000.webp or .png and so on; add them, or take the camera out of "
-                    f"{RECORD_NAME}"
-                )
-            if len(there) < frames:
-                gap = min(set(range(frames)) - set(there))
-                LOGGER.warning(
-                    "Images %s: %s lacks %d of %d frames, the first is %d; it does without them",
-                    *(self.path, camera.name, frames - len(there), frames, gap),
-                )
-            self._check_size(camera, str(self._find(camera, there[0])))
-
-    def _find(self, camera: Camera, frame: int) -> str | None:
-        names = (f"{camera.name}/{frame:04d}{suffix}" for suffix in _SUFFIXES)
-        return next((name for name in names if name in self.names), None)
-
-    def _load(self, name: str) -> bytes:
-        try:
-            return self.archive.read(name) if self.archive else (self.path / name).read_bytes()
-        except (OSError, zipfile.BadZipFile, zlib.error) as error:
-            raise CaptureError(f"image {name} in {self.path}: cannot be read ({error})") from error
-
-    def _relative(self, path: Path) -> str:
-        return path.relative_to(self.path).as_posix()
-
-    def _check_size(self, camera: Camera, name: str) -> None:
-        """Read no more of an image than its header."""
-        try:
-            with Image.open(io.BytesIO(self._load(name))) as image:
-                size, mode = image.size, image.mode
-        except (OSError, UnidentifiedImageError) as error:
-            raise CaptureError(f"image {name} in {self.path}: cannot be decoded ({error})") from error
-        if size != (camera.width, camera.height) or mode != "RGBA":
-            raise CaptureError(
-                f"image {name} in {self.path}: expected RGBA of {camera.width}x{camera.height} as "
-                f"{camera.name} in {RECORD_NAME}, found {mode} of {size[0]}x{size[1]}"
-            )
-
-
-def _open_archive(path: Path) -> zipfile.ZipFile:
-    try:
-        return zipfile.ZipFile(path)
-    except (OSError, zipfile.BadZipFile) as error:
-        raise CaptureError(f"images {path}: expected a folder or a zip file ({error})") from error
 
 
 def open_native(root: Path, body: Path | None = None) -> MultiViewCapture:
@@ -115,7 +41,7 @@ def open_native(root: Path, body: Path | None = None) -> MultiViewCapture:
         MotionError: A motion file is malformed.
         BodyError: The body-model file is.
     """
-    where = root / RECORD_NAME
+    where = find_file(root, RECORD_NAME)
     record = _read_record(where)
     cameras = [
         _read_camera(entry, f"{where}, camera {k}")
@@ -125,25 +51,33 @@ def open_native(root: Path, body: Path | None = None) -> MultiViewCapture:
     if not cameras or len(set(names)) != len(names):
         raise CaptureError(f"{where}: expected at least one camera and names that differ, found {names}")
     fps = float(_get(record, "fps", (int, float), where))
+    if not (math.isfinite(fps) and fps > 0):
+        raise CaptureError(f"{where}: expected 'fps' as a number above 0, found {fps}")
     sequences: dict[str, dict[str, Any]] = _get(record, "sequences", dict, where)
+    for name in sequences:
+        check_name(f"{where}, sequences", name)
     splits = _read_splits(sequences, where)
     pairs = tuple(_read_pair(entry, sequences, where) for entry in record.get("one_to_many", []))
-    images = {}
+    images, garments, label = {}, {}, _get(record, "name", str, where)
+    conversions = Conversions(label)
     for name, entry in sequences.items():
-        images[name] = _Images(root / _get(entry, "images", str, f"{where}, sequence {name}"))
-        images[name].check(cameras, _get(entry, "frames", int, f"{where}, sequence {name}"))
-    recorded = root / record["body"] if record.get("body") else None
+        at = f"{where}, sequence {name}"
+        images[name] = Cutouts(inside(at, root, _get(entry, "images", str, at)), conversions)
+        images[name].check(cameras, _get(entry, "frames", int, at))
+        if entry.get("garment"):
+            garments[name] = inside(at, root, _get(entry, "garment", str, at))
+    recorded = inside(str(where), root, _get(record, "body", str, where)) if record.get("body") else None
     body_path = choose_body(body, "neutral") if body else recorded
     if body_path != recorded:
         LOGGER.warning(
             "Capture %s: shape and motion were fitted with %s; with %s they may be centimetres off",
             *(root, recorded or "the embedded body", body_path),
         )
-    betas = torch.tensor(_get(record, "betas", list, where), dtype=torch.float32)
+    betas = _read_betas(_get(record, "betas", list, where), where)
     shaped = load_body(body_path, betas if len(betas) else None)
     return MultiViewCapture(
         root=root,
-        name=_get(record, "name", str, where),
+        name=label,
         fps=fps,
         cameras=tuple(cameras),
         body=shaped,
@@ -156,15 +90,12 @@ def open_native(root: Path, body: Path | None = None) -> MultiViewCapture:
         one_to_many=pairs,
         views=images,
         reopen=partial(open_native, root, body),
-        garments={name: root / entry["garment"] for name, entry in sequences.items() if entry.get("garment")},
+        garments=garments,
     )
 
 
 def _read_record(where: Path) -> dict[str, Any]:
-    try:
-        record = json.loads(where.read_text())
-    except (OSError, ValueError) as error:
-        raise CaptureError(f"{where}: cannot be read as JSON ({error})") from error
+    record = read_json(where, CaptureError)
     found = (record.get("format"), record.get("version")) if isinstance(record, dict) else (None, None)
     if found != (FORMAT, VERSION):
         raise CaptureError(
@@ -176,7 +107,8 @@ def _read_record(where: Path) -> dict[str, Any]:
 def _get(record: Mapping[str, Any], key: str, kind: type[T] | tuple[type[T], ...], where: object) -> T:
     """Return a field of the right JSON type, or raise CaptureError."""
     value = record.get(key)
-    if not isinstance(value, kind):
+    # In Python, true is the whole number 1.
+    if not isinstance(value, kind) or isinstance(value, bool):
         kinds = kind if isinstance(kind, tuple) else (kind,)
         expected = " or ".join(k.__name__ for k in kinds)
         raise CaptureError(f"{where}: expected {key!r} as {expected}, found {value!r}")
@@ -192,16 +124,27 @@ def _read_camera(entry: Mapping[str, Any], where: str) -> Camera:
     return make_camera(f"{where} {name}", name, matrices["K"], matrices["T_camera_world"], size)
 
 
+def _read_betas(numbers: list[Any], where: Path) -> Float[Tensor, " s"]:
+    try:
+        betas = torch.tensor(numbers, dtype=torch.float32)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise CaptureError(f"{where}: 'betas' is not a list of numbers ({error})") from error
+    if betas.ndim != 1 or not bool(betas.isfinite().all()):
+        raise CaptureError(f"{where}: expected 'betas' as a list of finite numbers, found {numbers}")
+    return betas
+
+
 def _read_sequence_motion(root: Path, name: str, entry: Mapping[str, Any], body: Body, fps: float) -> Motion:
     where = f"{root / RECORD_NAME}, sequence {name}"
-    path = root / _get(entry, "motion", str, where)
+    path = inside(where, root, _get(entry, "motion", str, where))
     motion, frames = read_motion(path, body, up="z"), _get(entry, "frames", int, where)
-    if len(motion) != frames or motion.fps != fps:
+    if len(motion) != frames or not same_rate(motion.fps, fps):
         raise CaptureError(
-            f"{where}: expected {frames} frames at {fps:g} a second, found {len(motion)} at {motion.fps:g} "
-            f"in {path}"
+            f"{where}: expected {frames} frames at {fps:.8g} a second, found {len(motion)} at "
+            f"{motion.fps:.8g} in {path}"
         )
-    return Motion(motion.rotations, motion.translations, motion.fps, name)
+    # All sequences have the record's rate to the last digit, however their files round it.
+    return Motion(motion.rotations, motion.translations, fps, name)
 
 
 def _read_splits(sequences: Mapping[str, Mapping[str, Any]], where: Path) -> dict[str, tuple[str, ...]]:

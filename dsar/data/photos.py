@@ -1,16 +1,21 @@
 """Photographs and masks in a file each, as most captures hold them."""
 
+from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
-from PIL import Image, UnidentifiedImageError
 
+from dsar.data.conversions import Conversions, Note
 from dsar.data.distortion import undistort
-from dsar.data.images import CACHE, decode_photo
+from dsar.data.folders import Finder
+from dsar.data.images import CACHE, decode_mask, decode_photograph, judge_header
+from dsar.data.masks import Coding, find_coding, spread
 from dsar.errors import CaptureError
+from dsar.text import read_text
 from dsar.types import Camera
 
 
@@ -32,46 +37,87 @@ class Photos:
     """k1, k2, p1, p2, k3 of each of our cameras; none: no distortion."""
     missing: Collection[tuple[str, int | str]] = frozenset()
     """Cameras and frames, by the files' names, that are known to be missing or spoilt."""
+    conversions: Conversions = field(default_factory=lambda: Conversions("images"), compare=False)
+    """Tells what is converted."""
 
-    def paths(self, camera: Camera, frame: int) -> tuple[Path, Path]:
-        """Return where a photograph and its mask should be."""
-        names = {"camera": self.folders[camera.name], "frame": self.frames[frame]}
-        return self.root / self.color.format(**names), self.root / self.mask.format(**names)
+    @cached_property
+    def _finder(self) -> Finder:
+        return Finder(self.root)
+
+    @cached_property
+    def _codings(self) -> dict[str, Coding]:
+        return {}
 
     def expected(self, camera: Camera) -> str:
         """Return where the first photograph and its mask should be, in words."""
-        return " and ".join(map(str, self.paths(camera, 0)))
+        return " and ".join(map(str, self._patterns(camera, 0)))
 
     def has(self, camera: Camera, frame: int) -> bool:
         """Return whether a photograph and its mask are there."""
-        if (self.folders[camera.name], self.frames[frame]) in self.missing:
-            return False
-        return all(path.is_file() for path in self.paths(camera, frame))
+        return self._files(camera, frame) is not None
 
     def read(self, camera: Camera, frame: int) -> UInt8[np.ndarray, "h w 4"]:
         """Return an undistorted photograph with its mask as alpha, or raise CaptureError."""
-        color, mask = self.paths(camera, frame)
-        for path in (color, mask):
-            if not path.is_file():
-                raise CaptureError(f"image {path}: no such file")
+        files = self._existing(camera, frame)
 
         def make() -> np.ndarray:
-            return undistort(decode_photo(color, mask, camera), camera, self.distortion.get(camera.name, ()))
+            rgba = self._decode(camera, *files)
+            return undistort(rgba, camera, self.distortion.get(camera.name, ()))
 
-        return CACHE.get((color, camera.name), make)
+        return CACHE.get((files, camera.name), make)
 
+    def survey(self, cameras: Sequence[Camera]) -> None:
+        """Look at the first photograph and some masks of each camera, and log what is converted.
 
-def image_size(path: Path) -> tuple[int, int]:
-    """Return the width and height that an image's header says.
+        Raises:
+            CaptureError: They are not what a camera's photographs and masks can be.
+        """
+        found: dict[tuple[str, Note], list[Path]] = defaultdict(list)
+        for camera in cameras:
+            frame = next(frame for frame in range(len(self.frames)) if self.has(camera, frame))
+            color, mask = self._existing(camera, frame)
+            for note in judge_header(color, camera, str(color), mask):
+                found["photographs", note].append(color)
+            for note in self._coding(camera).notes:
+                found["masks", note].append(mask)
+        for (kind, note), files in found.items():
+            share = f" of {len(files)} of {len(cameras)} cameras"
+            self.conversions.say(kind, [note], str(files[0]), share)
 
-    Raises:
-        CaptureError: it is not there or no image.
-    """
-    try:
-        with Image.open(path) as image:
-            return image.size
-    except (OSError, UnidentifiedImageError) as error:
-        raise CaptureError(f"image {path}: cannot be read ({error})") from error
+    def _decode(self, camera: Camera, color: Path, mask: Path) -> UInt8[np.ndarray, "h w 4"]:
+        photograph = decode_photograph(color, camera, str(color), mask)
+        levels = decode_mask(mask, camera, color)
+        self.conversions.say("photographs", photograph.notes, str(color))
+        self.conversions.say("masks", levels.notes, str(mask))
+        return np.dstack([photograph.color, self._coding(camera).decode(levels, str(mask))])
+
+    def _coding(self, camera: Camera) -> Coding:
+        """Return how a camera's masks are written: found once, from masks of all of the take."""
+        if camera.name not in self._codings:
+            frames = [frame for frame in range(len(self.frames)) if self.has(camera, frame)]
+            files = filter(None, (self._files(camera, frame) for frame in spread(frames)))
+            self._codings[camera.name] = find_coding(
+                (partial(decode_mask, mask, camera, color), str(mask)) for color, mask in files
+            )
+        return self._codings[camera.name]
+
+    def _files(self, camera: Camera, frame: int) -> tuple[Path, Path] | None:
+        """Return a photograph and its mask, None unless both are there."""
+        if (self.folders[camera.name], self.frames[frame]) in self.missing:
+            return None
+        color, mask = map(self._finder.find, self._patterns(camera, frame))
+        return (color, mask) if color and mask else None
+
+    def _existing(self, camera: Camera, frame: int) -> tuple[Path, Path]:
+        files = self._files(camera, frame)
+        if files is None:
+            lacking = [path for path in self._patterns(camera, frame) if not self._finder.find(path)]
+            raise CaptureError(f"image {lacking[0] if lacking else camera.name}: no such file")
+        return files
+
+    def _patterns(self, camera: Camera, frame: int) -> tuple[Path, Path]:
+        names = {"camera": self.folders[camera.name], "frame": self.frames[frame]}
+        return self.root / self.color.format(**names), self.root / self.mask.format(**names)
 
 
 def read_missing(path: Path) -> frozenset[tuple[str, int]]:
@@ -83,11 +129,7 @@ def read_missing(path: Path) -> frozenset[tuple[str, int]]:
     found = set()
     if not path.is_file():
         return frozenset()
-    try:
-        text = path.read_text()
-    except (OSError, UnicodeDecodeError) as error:
-        raise CaptureError(f"{path}: cannot be read as text ({error})") from error
-    for number, line in enumerate(text.splitlines(), 1):
+    for number, line in enumerate(read_text(path, CaptureError).splitlines(), 1):
         parts = line.strip().replace("\\", "/").split("/")
         if parts == [""]:
             continue

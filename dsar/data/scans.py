@@ -159,6 +159,10 @@ class PhotosAndScans:
         key = (self.scans.paths(frame)[0], camera.name)
         return CACHE.get(key, lambda: self.scans.render(own, frame))
 
+    def survey(self, cameras: Sequence[Camera]) -> None:
+        """Look at some photographs of each released camera, log what is converted, or raise CaptureError."""
+        self.photos.survey([camera for camera in cameras if camera.name not in self.cameras])
+
     def expected(self, camera: Camera) -> str:
         """Return where a camera's first image should come from, in words."""
         if camera.name in self.cameras:

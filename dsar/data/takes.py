@@ -36,6 +36,10 @@ class FiledViews(Views, Protocol):
         """Return where a camera's first image should be, in words."""
         ...
 
+    def survey(self, cameras: Sequence[Camera]) -> None:
+        """Look at some images of each camera, log what is converted, or raise CaptureError."""
+        ...
+
 
 @dataclass(frozen=True)
 class Take:
@@ -87,11 +91,18 @@ def make_capture(
         CaptureError: nothing is left to train with, or images are missing altogether.
         BodyError: the body file is not usable.
     """
+    names = [camera.name for camera in cameras]
+    if len(set(names)) != len(names):
+        raise CaptureError(
+            f"capture {root}: expected cameras whose names differ in letters and digits, found "
+            f"{', '.join(names)}"
+        )
     body, path = fitted_body(str(root), opening.body, betas, gender)
     turn = upright(str(root), [take.motion for take in takes])
     cameras = [turn_camera(camera, turn) for camera in cameras]
     for take in takes:
         _count_images(f"capture {root}, {take.motion.name}", cameras, take)
+        take.views.survey(cameras)
     parts, splits = _split(str(root), takes, opening)
     motions, starts, views = {}, {}, {}
     for key, (take, frames) in parts.items():

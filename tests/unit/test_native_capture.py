@@ -127,7 +127,11 @@ def test_pickling_sends_a_path_and_no_images(folder):
         (("cameras", 0, "K", 0, 0), -1.0, "expected K as"),
         (("cameras", 1, "T_camera_world", 0, 0), 2.0, "cam1: T_camera_world is not rigid"),
         (("cameras", 1, "T_camera_world"), [[1, 0], [0, 1]], "not a 4x4 matrix"),
-        (("cameras", 0, "width"), 13, "cam0/0000.png.*expected RGBA of 13x16.*found RGBA of 12x16"),
+        (
+            ("cameras", 0, "width"),
+            13,
+            "cam0/0000.png.*expected 13x16 pixels as camera cam0.*found 12x16",
+        ),
         (("sequences", "walk", "frames"), 4, "expected 4 frames at 30 a second, found 3"),
         (("sequences", "walk", "frames"), 2, "one_to_many: walk has 2 frames, found 1-2"),
         (("fps",), 25.0, "expected 3 frames at 25 a second, found 3 at 30"),
@@ -166,7 +170,7 @@ def test_a_camera_without_any_frame_is_refused(folder):
 
 def test_an_image_without_mask_is_refused(folder):
     Image.fromarray(_image(0, 0)[..., :3]).save(folder / "walk/cam0/0000.png")
-    with pytest.raises(CaptureError, match="found RGB of 12x16"):
+    with pytest.raises(CaptureError, match="expected RGBA, found RGB; the mask"):
         open_capture(folder)
 
 

@@ -13,12 +13,16 @@ from torch import Tensor
 
 from dsar.avatar.track import find_jumps
 from dsar.body.skinning import forward_kinematics
+from dsar.color import linear_from_srgb
 from dsar.data.multiview import MultiViewCapture
 from dsar.data.novelty import joint_speeds
 from dsar.errors import CaptureError
 
 _THREADS = 2
 _MOVING = 0.05
+_RIM = 0.05
+_SKIPPED = 4
+_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 _EDGES = (0.0, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
 
 
@@ -36,6 +40,14 @@ class Picture:
     """Share of the image that the mask covers."""
     border: float
     """Share of the image's border that it covers."""
+    full: bool
+    """Whether it covers everything, but for a rim that undistortion may have left."""
+    highest: int
+    """The mask's highest number, 0 to 255."""
+    light: float
+    """Mean luminance of the person, linear, 0 to 1; 0 without one."""
+    chroma: float
+    """Mean distance between the channels of the person's pixels, 0 to 255; 0 without one."""
     broken: str | None = None
     """Why it cannot be read."""
 
@@ -47,8 +59,9 @@ def read_pictures(capture: MultiViewCapture) -> Iterator[Picture]:
         try:
             image = capture.image(*place)
         except CaptureError as error:
-            return Picture(*place, b"", 0.0, 0.0, str(error))
-        return Picture(*place, blake2b(image.tobytes(), digest_size=16).digest(), *_cover(image[..., 3]))
+            return Picture(*place, b"", 0.0, 0.0, False, 0, 0.0, 0.0, str(error))
+        digest = blake2b(image.tobytes(), digest_size=16).digest()
+        return Picture(*place, digest, *_cover(image[..., 3]), int(image[..., 3].max()), *_describe(image))
 
     places = []
     for name, motion in capture.motions.items():
@@ -96,6 +109,19 @@ def histogram(values: Float[Tensor, " n"]) -> dict[str, int]:
     return dict(zip([*names, f">{_EDGES[-1]:g}"], counts, strict=True))
 
 
-def _cover(alpha: UInt8[np.ndarray, "h w"]) -> tuple[float, float]:
+def _cover(alpha: UInt8[np.ndarray, "h w"]) -> tuple[float, float, bool]:
+    """Return the shares of a mask and of its border that are covered, and whether all but a rim is."""
     border = np.concatenate([alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1]])
-    return float((alpha > 127).mean()), float((border > 127).mean())
+    y, x = (int(_RIM * size) for size in alpha.shape)
+    full = bool((alpha[y : alpha.shape[0] - y, x : alpha.shape[1] - x] > 127).all())
+    return float((alpha > 127).mean()), float((border > 127).mean()), full
+
+
+def _describe(image: UInt8[np.ndarray, "h w 4"]) -> tuple[float, float]:
+    """Return the person's mean linear luminance and mean distance between channels, from some pixels."""
+    some = image[::_SKIPPED, ::_SKIPPED]
+    person = some[some[..., 3] > 127][:, :3]
+    if not len(person):
+        return 0.0, 0.0
+    luminance = linear_from_srgb(person / 255) @ _LUMINANCE
+    return float(luminance.mean()), float(np.ptp(person, axis=1).mean())

@@ -29,6 +29,7 @@ from dsar.evaluation.check.agreement import (
     load_masks,
     read,
 )
+from dsar.evaluation.check.finding import Finding
 from dsar.evaluation.check.mistakes import (
     Suspect,
     coarse_mistakes,
@@ -38,6 +39,7 @@ from dsar.evaluation.check.mistakes import (
     hand_mistakes,
     is_clearer,
 )
+from dsar.evaluation.check.pictures import judge_colors, judge_masks
 
 APART = 0.5
 """Share of the body in the masks below which a capture cannot train."""
@@ -54,18 +56,6 @@ _LATEST = 5
 _LISTED = 5
 Reporter = Callable[[str, float], None]
 """Is told what is being done, and the share of it that is done."""
-
-
-@dataclass(frozen=True)
-class Finding:
-    """Something that is wrong."""
-
-    name: str
-    """A word for it, stable."""
-    what: str
-    """What, where, and what to do."""
-    fatal: bool = False
-    """Whether the capture cannot train."""
 
 
 @dataclass(frozen=True)
@@ -115,12 +105,15 @@ def check_capture(capture: MultiViewCapture, report: Reporter = lambda *_: None)
         report("read images", 0.8 * len(pictures) / max(total, 1))
     readable = [picture for picture in pictures if picture.broken is None]
     if not readable:
-        raise CaptureError(f"capture {capture.name}: none of its {total} images can be read")
+        raise CaptureError(
+            f"capture {capture.name}: none of its {total} images can be read; the first: {pictures[0].broken}"
+        )
     findings += _judge_pictures(capture, pictures)
     figures["read_ms"] = 1e3 * (time.monotonic() - began) / total
     figures |= _describe(capture, pictures)
     report("compare body and masks", 0.8)
-    usable = {(p.sequence, p.frame, p.camera) for p in readable if p.coverage > 0}
+    usable = {(p.sequence, p.frame, p.camera) for p in readable if p.coverage > 0 and not p.full}
+    findings += judge_colors(capture, readable, usable)
     findings += _judge_gaps(capture, {(picture.sequence, picture.frame) for picture in readable})
     masks, reading = load_masks(capture, usable), read(capture)
     agreements = list(compare(reading, masks))
@@ -156,35 +149,9 @@ def _judge_pictures(capture: MultiViewCapture, pictures: Sequence[content.Pictur
     findings = []
     broken = [picture.broken for picture in pictures if picture.broken is not None]
     if broken:
-        findings.append(
-            Finding(
-                "broken_images",
-                f"{len(broken)} images cannot be read; replace or delete them: {broken[0]}",
-                True,
-            )
-        )
-    sound = [picture for picture in pictures if picture.broken is None]
-    border = statistics.fmean(each.border for each in sound)
-    if border > 0.5:
-        findings.append(
-            Finding(
-                "masks_inverted",
-                f"masks cover {border:.0%} of the images' borders: they show the background; invert them",
-                True,
-            )
-        )
-    empty = [picture for picture in sound if picture.coverage == 0]
-    if empty:
-        first = empty[0]
-        where = f"{first.sequence}, frame {first.frame}, {capture.cameras[first.camera].name}"
-        everything = len(empty) == len(sound)
-        findings.append(
-            Finding(
-                "empty_masks",
-                f"{len(empty)} masks are empty, the first is {where}; make them anew",
-                everything,
-            )
-        )
+        what = f"{len(broken)} images cannot be used; the first: {broken[0]}"
+        findings.append(Finding("broken_images", what, True))
+    findings += judge_masks(capture, [picture for picture in pictures if picture.broken is None])
     for camera, count in sorted(content.count_duplicates(capture, pictures).items()):
         findings.append(
             Finding(

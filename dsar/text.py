@@ -1,0 +1,36 @@
+"""Text and JSON as people's tools write them: with or without a byte-order mark, in UTF-8 or UTF-16."""
+
+import codecs
+import json
+from pathlib import Path
+from typing import Any
+
+
+def read_text(path: Path, error: type[Exception]) -> str:
+    """Return what a text file holds, without its byte-order mark and with line ends as newlines.
+
+    Args:
+        path: In UTF-8, or in what its byte-order mark says.
+        error: Raised, with a message, where it cannot be read.
+    """
+    try:
+        data = path.read_bytes()
+        wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+        text = data.decode("utf-16" if wide else "utf-8-sig")
+    except (OSError, UnicodeDecodeError) as cause:
+        raise error(f"{path}: cannot be read as text ({cause})") from cause
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def read_json(path: Path, error: type[Exception]) -> Any:
+    """Return what a JSON file holds.
+
+    Args:
+        path: As `read_text` takes it.
+        error: Raised, with a message, where it cannot be read.
+    """
+    text = read_text(path, error)
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as cause:
+        raise error(f"{path}: cannot be read as JSON ({cause})") from cause
