@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from dsar.cli.common import Common, capture_sequence
+from dsar.geometry.rates import exact_rate, parse_rate, same_rate
 from dsar.types import Camera, GaussianSequence, Motion
 
 if TYPE_CHECKING:
@@ -17,10 +18,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Performance:
-    """An avatar, a motion at its rate, and where both come from."""
+    """An avatar, a motion at its rate and at that of the delivery, and where they come from."""
 
     avatar: "Avatar"
     motion: Motion
+    delivered: Motion
+    """The same at the rate of the frames that are written."""
     cameras: tuple[Camera, ...]
     """Those of the capture."""
     provenance: dict[str, str]
@@ -29,7 +32,8 @@ class Performance:
         """Return the Gaussians of some frames, all by default."""
         from dsar.avatar import roll_out
 
-        return roll_out(self.avatar, self.motion, frames=frames, provenance=self.provenance)
+        given = {"delivered": self.delivered, "provenance": self.provenance}
+        return roll_out(self.avatar, self.motion, frames=frames, **given)
 
 
 @dataclass(frozen=True)
@@ -40,8 +44,10 @@ class Drive(Common):
     """Run folder; default: the newest under runs/."""
     motion: str = "test"
     """An AMASS/SMPL-X .npz or .bvh file, a sequence of the run's capture, or its split `test` or `train`."""
+    fps: str | None = None
+    """Frames per second to deliver, e.g. 24, 23.976 or 24000/1001; default: the avatar's."""
     frames: str | None = None
-    """Frame numbers from 1001 on, e.g. 1001-1100x2; default: all."""
+    """Frame numbers from 1001 on, of those delivered, e.g. 1001-1100x2; default: all."""
 
     def wanted_frames(self) -> list[int] | None:
         """Return the frames that are asked for, None for all."""
@@ -64,6 +70,7 @@ class Drive(Common):
         from dsar.training.checkpoint import Run, load_checkpoint
 
         self.check_device()
+        fps = None if self.fps is None else parse_rate(self.fps)
         avatar, config, provenance = load_checkpoint(Run(self.chosen_run()))
         capture = capture_of(config)
         name = capture_sequence(capture, self.motion)
@@ -71,18 +78,20 @@ class Drive(Common):
             motion = capture.motions[name]
         else:
             motion = read_motion(Path(self.motion), avatar.body)
-        if motion.fps != avatar.fps:
-            motion = resample(motion, avatar.fps)
+        provenance["motion_hash"] = _hash(motion)
+        driven = delivered = motion if same_rate(motion.fps, avatar.fps) else resample(motion, avatar.fps)
+        if fps is not None and not same_rate(fps, avatar.fps):
+            delivered = resample(motion, fps)
+            provenance["fps"] = str(exact_rate(fps))
         if name is None:
             known = [capture.motions[trained] for trained in capture.splits["train"]]
-            report_novelty(avatar.body, motion, known, START_FRAME)
-        provenance["motion_hash"] = _hash(motion)
-        return Performance(avatar, motion, tuple(capture.cameras), provenance)
+            report_novelty(avatar.body, delivered, known, START_FRAME)
+        return Performance(avatar, driven, delivered, tuple(capture.cameras), provenance)
 
 
 def _hash(motion: Motion) -> str:
-    """Return a hash of the poses: a file may change and keep its name."""
-    digest = hashlib.sha256()
+    """Return a hash of the poses and their rate: a file may change and keep its name."""
+    digest = hashlib.sha256(repr(motion.fps).encode())
     for values in (motion.rotations, motion.translations):
         digest.update(values.cpu().contiguous().numpy().tobytes())
     return digest.hexdigest()[:16]

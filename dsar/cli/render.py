@@ -187,7 +187,7 @@ class Render(Drive):
         if self.cameras.suffix.lower() in (".usd", ".usda", ".usdc", ".usdz"):
             from dsar_exporters import read_usd_cameras
 
-            fps = performance.motion.fps
+            fps = performance.delivered.fps
             return read_usd_cameras(self.cameras, frames=frames, resolution=self.res, fps=fps)
         return read_cameras_json(self.cameras)
 

@@ -16,6 +16,7 @@ from torch import Tensor
 from dsar.data.bvh import read_bvh
 from dsar.data.poses import read_arrays, read_poses, read_rate
 from dsar.errors import MotionError
+from dsar.geometry.rates import exact_rate
 from dsar.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
 from dsar.types import Body, Motion
 
@@ -91,8 +92,8 @@ def resample(motion: Motion, fps: float) -> Motion:
     """
     if not 0 < fps < float("inf"):
         raise MotionError(f"motion {motion.name}: cannot be resampled to {fps} frames per second")
-    last, step = len(motion) - 1, motion.fps / fps
-    # A millionth of a frame forgives the rounding of e.g. 29.97 / 119.88.
+    last, step = len(motion) - 1, float(exact_rate(motion.fps) / exact_rate(fps))
+    # A millionth of a frame forgives the rounding of e.g. 30 / 23.976.
     times = torch.arange(int(last / step + 1e-6) + 1, dtype=torch.float64) * step
     before = times.floor().long().clamp(max=last)
     after = (before + 1).clamp(max=last)

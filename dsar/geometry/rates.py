@@ -25,7 +25,7 @@ def exact_rate(fps: float) -> Fraction:
     for meant in (Fraction(whole), whole * _NTSC):
         if meant and same_rate(fps, float(meant)):
             return meant
-    return Fraction(fps).limit_denominator(1000)
+    return Fraction(fps).limit_denominator(10**6)
 
 
 def parse_rate(text: str, flag: str = "--fps") -> float:
