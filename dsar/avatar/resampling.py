@@ -1,8 +1,8 @@
 """Deliveries at other frame rates than the avatar's: where their frames lie in a rollout, and what is there.
 
-The network steps at the rate that it was trained at, whatever is delivered. Between two steps, what it adds to
-the template at rest is blended in a line (of scales their logarithms, of opacities their logits), and posed by
-the motion at that very time: limbs and what they carry go on arcs, not on the chords between posed frames.
+The network steps at the rate that it was trained at, whatever is delivered. Between two steps what it adds
+to the template at rest is blended in a line (of scales their logarithms, of opacities their logits), and
+posed by the motion at that very time: limbs go on arcs, not on chords between posed frames.
 """
 
 from collections.abc import Collection
@@ -35,7 +35,7 @@ def place_frames(body: Body, motion: Motion, delivered: Motion) -> list[Moment]:
     """Return where each frame of a delivery lies in the rollout of a motion; both begin together.
 
     Times are exact: 24 and 24000/1001 frames a second meet 30 where they truly do. Across a jump of the body
-    (a cut) nothing is blended: the nearer frame is taken. After the rollout's last frame it stays.
+    (a cut) nothing is blended: the nearer frame is taken.
 
     Raises:
         MotionError: the delivery goes on a frame of the rollout or more after the last.
@@ -47,7 +47,7 @@ def place_frames(body: Body, motion: Motion, delivered: Motion) -> list[Moment]:
             f"{len(delivered)} frames at {delivered.fps:g} a second: resample the same motion for both"
         )
     jumps = set(find_jumps(_transforms(body, motion), body.joints[0], motion.fps))
-    return [_place(frame * ratio, last, jumps) for frame in range(len(delivered))]
+    return [_place(frame * ratio, jumps) for frame in range(len(delivered))]
 
 
 def pose_frames(
@@ -72,12 +72,12 @@ def blend_residuals(first: NetworkOutput, second: NetworkOutput, share: float) -
     return NetworkOutput(offset, torch.lerp(first.appearance, second.appearance, share), ())
 
 
-def _place(time: Fraction, last: int, jumps: Collection[int]) -> Moment:
+def _place(time: Fraction, jumps: Collection[int]) -> Moment:
     """Return the moment of a time in frames of the rollout."""
     step, share = int(time), time % 1
     if step + 1 in jumps:
         step, share = step + round(share), Fraction(0)
-    return Moment(step, float(share)) if step < last else Moment(last, 0.0)
+    return Moment(step, float(share))
 
 
 def _transforms(body: Body, motion: Motion) -> Float[Tensor, "f j 4 4"]:

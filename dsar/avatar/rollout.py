@@ -11,13 +11,11 @@ from dsar.avatar.avatar import Avatar
 from dsar.avatar.resampling import Moment, blend_residuals, keep_residuals, place_frames, pose_frames
 from dsar.body.model import JOINT_NAMES
 from dsar.errors import MotionError
+from dsar.geometry.paths import START_FRAME
 from dsar.geometry.rates import same_rate
 from dsar.network import STREAMS, NetworkOutput, Stream
 from dsar.network.streaming import Rollout
 from dsar.types import Binding, Gaussians, GaussianSequence, Motion
-
-START_FRAME = 1001
-"""Number of a motion's first frame, as film pipelines count."""
 
 
 def roll_out(
@@ -122,7 +120,6 @@ def network_outputs(
         yield context, output
 
 
-@torch.no_grad()
 def _produce(
     avatar: Avatar,
     motion: Motion,
@@ -130,15 +127,17 @@ def _produce(
     poses: Float[Tensor, "f j 4 4"],
     streams: Collection[Stream],
 ) -> Iterator[Gaussians]:
-    """Yield the Gaussians at ascending moments of a rollout, and the poses there."""
-    steps = enumerate(network_outputs(avatar, motion, streams=streams))
-    step, (context, output) = next(steps)
-    before = output
+    """Yield the Gaussians at ascending moments of a rollout; `poses` are those of the body at each."""
+    steps = network_outputs(avatar, motion, streams=streams)
+    step, before, (context, output) = 0, None, next(steps)
     for moment, pose in zip(moments, poses, strict=True):
         while step < moment.step + (moment.share > 0):
             before = keep_residuals(output)
-            step, (context, output) = next(steps)
-        if moment.share == 0:
-            yield avatar.gaussians(context, output)[0]
-        else:
-            yield avatar.gaussians(pose[None, None], blend_residuals(before, output, moment.share))[0]
+            # After the last step its residuals stay.
+            step, (context, output) = step + 1, next(steps, (context, output))
+        with torch.no_grad():
+            if before is None or moment.share == 0:
+                made = avatar.gaussians(context, output)[0]
+            else:
+                made = avatar.gaussians(pose[None, None], blend_residuals(before, output, moment.share))[0]
+        yield made

@@ -184,12 +184,12 @@ class Render(Drive):
         """Return the cameras to choose from: the capture's, or a file's."""
         if self.cameras is None:
             return [CameraPath((camera,)) for camera in performance.cameras]
+        fps = performance.delivered.fps
         if self.cameras.suffix.lower() in (".usd", ".usda", ".usdc", ".usdz"):
             from dsar_exporters import read_usd_cameras
 
-            fps = performance.delivered.fps
             return read_usd_cameras(self.cameras, frames=frames, resolution=self.res, fps=fps)
-        return read_cameras_json(self.cameras)
+        return read_cameras_json(self.cameras, fps)
 
     def check_together(self, paths: Sequence[CameraPath]) -> None:
         """Check what the chosen cameras have to have in common."""

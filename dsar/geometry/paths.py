@@ -19,7 +19,8 @@ TURNTABLE, ORBIT, DOLLY = "turntable", "orbit", "dolly"
 """Names of the cameras that are made here, beside those of a capture's."""
 PERIOD_S = 8.0
 """Seconds of one turn of the turntable and of the orbit."""
-_START_FRAME = 1001
+START_FRAME = 1001
+"""Number of a motion's first frame at every rate, as film pipelines count."""
 _DISTANCE = 2.6
 """The turntable's distance from the person, in heights of the person."""
 _MARGIN = 1.35
@@ -44,8 +45,8 @@ class CameraPath:
 
     cameras: tuple[Camera, ...]
     """Views of one name and size."""
-    frames: tuple[int, ...] = ()
-    """Frame numbers, ascending, one per camera; empty for the one camera of a path at rest."""
+    frames: tuple[float | int, ...] = ()
+    """Frame numbers or times between, ascending, one per camera; empty for one camera at rest."""
 
     def __post_init__(self) -> None:
         """Check that the keys are those of one camera."""
@@ -209,7 +210,7 @@ def _half_picture(width: int, height: int) -> Float[np.ndarray, "2"]:
 
 def _circle(frame_numbers: Sequence[int], fps: float) -> Float[np.ndarray, "f 3"]:
     """Return the directions in which a camera that circles stands."""
-    angles = 2 * math.pi * (np.asarray(frame_numbers) - _START_FRAME) / (fps * PERIOD_S)
+    angles = 2 * math.pi * (np.asarray(frame_numbers) - START_FRAME) / (fps * PERIOD_S)
     level, up = math.cos(_ELEVATION), math.sin(_ELEVATION)
     return np.stack([np.sin(angles) * level, np.full(angles.shape, up), np.cos(angles) * level], -1)
 

@@ -62,5 +62,5 @@ def test_a_rate_is_read_as_people_write_it(text: str, meant: Fraction) -> None:
     ["nan", "inf", "0", "-24", "1e6", "1e1", "1001", "0.5", "film", "", "24/0", "24/", "/2", "9" * 5000],
 )
 def test_what_is_no_rate_is_refused_with_the_flag(text: str) -> None:
-    with pytest.raises(ConfigError, match="^--fps .*from 1 to 1000, such as 24, 23.976 or 24000/1001$"):
+    with pytest.raises(ConfigError, match=r"^--fps .*from 1 to 1000, such as 24, 23\.976 or 24000/1001$"):
         parse_rate(text)
