@@ -73,7 +73,8 @@ def same(one: Gaussians, two: Gaussians) -> bool:
 @pytest.mark.parametrize("fps", RATES)
 def test_frames_lie_by_seconds_and_are_the_rollouts_own_where_they_meet(avatar, fps):
     motion = spin()
-    own = [gaussians for _, gaussians in roll_out(avatar, motion)]
+    rolled = roll_out(avatar, motion)
+    own = [gaussians for _, gaussians in rolled]
     sequence = roll_out(avatar, motion, delivered=resample(motion, fps))
     ratio = 30 / exact_rate(fps)
     last = math.floor((FRAMES - 1) / ratio)
@@ -86,7 +87,7 @@ def test_frames_lie_by_seconds_and_are_the_rollouts_own_where_they_meet(avatar, 
         if time.denominator == 1:
             meetings += 1
             assert same(gaussians, own[int(time)])
-            assert torch.equal(places, roll_out(avatar, motion).binding.T_world_rest[int(time)])
+            assert torch.equal(places, rolled.binding.T_world_rest[int(time)])
         else:
             assert not any(torch.equal(gaussians.means, each.means) for each in own)
     # Of 30, 24 meets every fifth frame and 25 every sixth, 48 every fifth, 60 all, 23.976 the first alone.
