@@ -58,7 +58,7 @@ def roll_out(
     if outside or not numbers:
         raise MotionError(
             f"frame {outside[0] if outside else 'range'} is outside motion {motion.name}, "
-            f"which has frames {START_FRAME}-{last}"
+            f"which has frames {START_FRAME}-{last} at {delivered.fps:g} a second"
         )
     numbers = sorted(set(numbers))
     wanted = [number - START_FRAME for number in numbers]

@@ -166,6 +166,19 @@ def test_cameras_move_by_seconds_whatever_is_delivered(trained, tiny_capture, tm
         assert np.abs(one - two).max() <= 1
 
 
+def test_a_stages_camera_at_the_rate_of_delivery_moves_with_it(trained, tmp_path):
+    command("export", trained, "--fps", "24", "--usd", tmp_path / "a.usda")
+    shot = ("--fps", "24", "--camera", "turntable", "--frames", "1006", "--res", 48, 64)
+    command("render", trained, "--png", tmp_path / "made", *shot)
+    command("render", trained, "--png", tmp_path / "read", "--cameras", tmp_path / "a.usda", *shot)
+    made, read = (
+        np.asarray(Image.open(tmp_path / name / "turntable/avatar.turntable.1006.png")).astype(int)
+        for name in ("made", "read")
+    )
+    assert made[..., 3].max() > 200
+    assert np.abs(made - read).max() <= 2
+
+
 def test_a_farms_job_keeps_the_rate(trained, tmp_path):
     job = tmp_path / "job.json"
     command(
@@ -196,4 +209,4 @@ def test_frames_are_counted_at_the_rate_of_delivery(trained, tmp_path, capsys):
     assert [path.name for path in (tmp_path / "ply").iterdir()] == ["avatar.1019.ply"]
     with pytest.raises(SystemExit):
         command("export", trained, "--fps", "24", "--ply", tmp_path / "ply", "--frames", "1009")
-    assert "which has frames 1001-1008" in capsys.readouterr().err
+    assert "which has frames 1001-1008 at 24 a second" in capsys.readouterr().err
