@@ -38,7 +38,7 @@ class Export(Drive):
     name: str = "avatar"
     """Name of the asset and of the files."""
     check: Path | None = None
-    """Write nothing; say what is wrong with this file, whoever wrote it (USD, PLY or SPZ)."""
+    """Write nothing; say what is wrong with this file, whoever wrote it (USD, PLY, SPZ or GLB)."""
 
     def run(self) -> None:
         """Write every requested format from one rollout, or check a file."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 from dsar.cli.drive import Drive, Performance
 from dsar.console import follow
 from dsar.errors import ConfigError
-from dsar.geometry.camera_files import read_cameras_json
+from dsar.geometry.camera_files import list_cameras_json, read_cameras_json
 from dsar.geometry.paths import DOLLY, ORBIT, TURNTABLE, CameraPath, dolly, orbit, turntable
 
 if TYPE_CHECKING:
@@ -160,36 +160,53 @@ class Render(Drive):
     def paths(self, performance: Performance, frames: Sequence[int]) -> list[CameraPath]:
         """Return the cameras to render, at the requested resolution."""
         whole = performance.roll_out()
+        names = self.camera_names(performance)
         rig = self.rig(performance, frames)
         found: list[CameraPath] = []
         for wanted in self.camera.split(","):
-            if wanted in _MADE and wanted not in [path.name for path in rig]:
+            if wanted in _MADE and wanted not in names:
                 assert whole.binding is not None
                 width, height = self.res or (rig[0].cameras[0].width, rig[0].cameras[0].height)
                 size = {"width": width, "height": height}
                 found.append(_MADE[wanted](whole.binding, whole.frame_numbers, whole.fps, **size))
                 continue
-            pattern = "*" if wanted == "all" else wanted
-            chosen = [path for path in rig if fnmatchcase(path.name, pattern)]
+            chosen = [path for path in rig if _means(wanted, path.name)]
             if not chosen:
-                names = ", ".join(path.name for path in rig)
-                raise ConfigError(f"--camera {wanted}: expected all, {', '.join(_MADE)}, or some of {names}")
+                raise ConfigError(
+                    f"--camera {wanted}: expected all, {', '.join(_MADE)}, or some of {', '.join(names)}"
+                )
             named = {path.name for path in found}
             found += [path for path in chosen if path.name not in named]
         sized = [path.resized(*self.res) if self.res else path for path in found]
         self.check_together(sized)
         return sized
 
-    def rig(self, performance: Performance, frames: Sequence[int]) -> list[CameraPath]:
-        """Return the cameras to choose from: the capture's, or a file's."""
+    def camera_names(self, performance: Performance) -> list[str]:
+        """Return the names of the cameras to choose from: the capture's, or a file's."""
         if self.cameras is None:
-            return [CameraPath((camera,)) for camera in performance.cameras]
+            return [camera.name for camera in performance.cameras]
+        if _is_usd(self.cameras):
+            from dsar_exporters import list_usd_cameras
+
+            return list_usd_cameras(self.cameras)
+        return list_cameras_json(self.cameras)
+
+    def rig(self, performance: Performance, frames: Sequence[int]) -> list[CameraPath]:
+        """Return the chosen cameras alone: others may be of a kind that cannot be drawn."""
+        names, wanted = self.camera_names(performance), self.camera.split(",")
+        chosen = {name for name in names if any(_means(each, name) for each in wanted)}
+        if self.res is None and any(each in _MADE and each not in names for each in wanted):
+            # Cameras that are made here have the first one's size.
+            chosen.add(names[0])
+        if self.cameras is None:
+            return [CameraPath((camera,)) for camera in performance.cameras if camera.name in chosen]
         fps = performance.delivered.fps
-        if self.cameras.suffix.lower() in (".usd", ".usda", ".usdc", ".usdz"):
+        if _is_usd(self.cameras):
             from dsar_exporters import read_usd_cameras
 
-            return read_usd_cameras(self.cameras, frames=frames, resolution=self.res, fps=fps)
-        return read_cameras_json(self.cameras, fps)
+            how = {"frames": frames, "resolution": self.res, "fps": fps}
+            return read_usd_cameras(self.cameras, **how, chosen=chosen)
+        return read_cameras_json(self.cameras, fps=fps, chosen=chosen)
 
     def check_together(self, paths: Sequence[CameraPath]) -> None:
         """Check what the chosen cameras have to have in common."""
@@ -223,6 +240,15 @@ class Render(Drive):
             found += [flag] if value is True else [flag, *map(_absolute, _listed(value))]
         # A task that is given out again goes on where it was cut off.
         return [*found, "--skip-existing"]
+
+
+def _means(wanted: str, name: str) -> bool:
+    """Return whether a part of --camera chooses a camera."""
+    return fnmatchcase(name, "*" if wanted == "all" else wanted)
+
+
+def _is_usd(path: Path) -> bool:
+    return path.suffix.lower() in (".usd", ".usda", ".usdc", ".usdz")
 
 
 def _listed(value: object) -> Sequence[object]:

@@ -4,7 +4,7 @@ import json
 import logging
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,18 @@ _FRAME = re.compile(r"-?\d+(\.\d+)?", re.ASCII)
 _RIGID_TOLERANCE = 1e-4
 
 
-def read_cameras_json(path: Path, fps: float | None = None) -> list[CameraPath]:
+def list_cameras_json(path: Path) -> list[str]:
+    """Return the names of a file's cameras, whatever else is wrong with these.
+
+    Raises:
+        ConfigError: It cannot be read, or a name is no identifier or is there twice.
+    """
+    return list(_by_name(_load(path), path))
+
+
+def read_cameras_json(
+    path: Path, *, fps: float | None = None, chosen: Collection[str] | None = None
+) -> list[CameraPath]:
     """Read cameras, in the file's order; a `capture.json` is such a file.
 
     `{"cameras": [{"name": ..., "K": ..., "T_camera_world": ..., "width": ..., "height": ...}]}`, with
@@ -36,10 +47,27 @@ def read_cameras_json(path: Path, fps: float | None = None) -> list[CameraPath]:
     Args:
         path: The file.
         fps: Frames per second of the frame numbers that are wanted; None: the file's.
+        chosen: Names of the cameras to read; others may be malformed. None: every one.
 
     Raises:
         ConfigError: It cannot be read, or its rate or a camera is incomplete or malformed.
     """
+    record = _load(path)
+    cameras = [
+        _read_path(entry, where)
+        for name, (where, entry) in _by_name(record, path).items()
+        if chosen is None or name in chosen
+    ]
+    own = _rate(record, str(path))
+    if own is None or fps is None or same_rate(own, fps):
+        return cameras
+    if any(camera.frames for camera in cameras):
+        _logger.info("%s: its cameras move at %g frames a second; taken at %g by seconds", path, own, fps)
+    return [_resampled(camera, float(exact_rate(fps) / exact_rate(own))) for camera in cameras]
+
+
+def _load(path: Path) -> Mapping[str, Any]:
+    """Return a file's record, which has a list of cameras."""
     try:
         record = json.loads(path.read_text())
     except (OSError, ValueError) as error:
@@ -53,14 +81,23 @@ def read_cameras_json(path: Path, fps: float | None = None) -> list[CameraPath]:
             f'{path}: expected {{"cameras": [...]}} with at least one camera, found {_shown(record)}: write '
             "it as in docs/capture-format.md"
         )
-    cameras = [_read_path(entry, f"{path}, camera {index}") for index, entry in enumerate(entries)]
-    _refuse_doubled([camera.name for camera in cameras], str(path))
-    own = _rate(record, str(path))
-    if own is None or fps is None or same_rate(own, fps):
-        return cameras
-    if any(camera.frames for camera in cameras):
-        _logger.info("%s: its cameras move at %g frames a second; taken at %g by seconds", path, own, fps)
-    return [_resampled(camera, float(exact_rate(fps) / exact_rate(own))) for camera in cameras]
+    return record
+
+
+def _by_name(record: Mapping[str, Any], path: Path) -> dict[str, tuple[str, Mapping[str, Any]]]:
+    """Return how errors call each camera, and what the file says of it, by its name."""
+    names, found = [], []
+    for index, entry in enumerate(record["cameras"]):
+        where = f"{path}, camera {index}"
+        if not isinstance(entry, dict):
+            raise ConfigError(
+                f"{where}: expected name, K, T_camera_world, width and height, found {_shown(entry)}: "
+                "correct it"
+            )
+        names.append(_checked_name(entry.get("name"), where))
+        found.append((f"{where} {names[-1]}", entry))
+    _refuse_doubled(names, str(path))
+    return dict(zip(names, found, strict=True))
 
 
 def write_cameras_json(paths: Sequence[CameraPath], path: Path) -> Path:
@@ -97,13 +134,8 @@ def _written(path: CameraPath) -> str:
     return f'{json.dumps(record)[:-1]}, "frames": {{\n' + ",\n".join(frames) + "\n}}"
 
 
-def _read_path(entry: object, where: str) -> CameraPath:
-    if not isinstance(entry, dict):
-        raise ConfigError(
-            f"{where}: expected name, K, T_camera_world, width and height, found {_shown(entry)}: correct it"
-        )
-    name = _checked_name(entry.get("name"), where)
-    where = f"{where} {name}"
+def _read_path(entry: Mapping[str, Any], where: str) -> CameraPath:
+    name = entry["name"]
     size = _size(entry, "width", where), _size(entry, "height", where)
     frames = entry.get("frames")
     if frames is None:

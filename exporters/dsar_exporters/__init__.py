@@ -19,7 +19,7 @@ from dsar_exporters.splats import (
     read_splats,
     write_ply,
 )
-from dsar_exporters.usd import UsdAsset, read_usd_cameras, write_usd
+from dsar_exporters.usd import UsdAsset, list_usd_cameras, read_usd_cameras, write_usd
 
 __all__ = [
     "ColorTarget",
@@ -34,6 +34,7 @@ __all__ = [
     "export",
     "exr_path",
     "find_faults",
+    "list_usd_cameras",
     "ocio_config",
     "parse_frames",
     "read_ply",

@@ -80,7 +80,7 @@ def checked_frames(sequence: GaussianSequence) -> Iterator[tuple[int, Gaussians]
         ExportError: A frame has another number of Gaussians than the sequence says, another number of
             harmonics than the first frame, or a value that is not finite or not what its field holds.
     """
-    harmonics_count = None
+    harmonics_count, sound = None, None
     for frame, gaussians in sequence:
         if len(gaussians) != sequence.num_gaussians:
             raise ExportError(
@@ -93,22 +93,28 @@ def checked_frames(sequence: GaussianSequence) -> Iterator[tuple[int, Gaussians]
             raise ExportError(f"frame {frame}: expected {expected} harmonics per Gaussian, found {found}")
         harmonics_count = found
         frame_values = gaussians.map(lambda values: values.detach().cpu().to(torch.float32).contiguous())
-        _check_finite(frame, frame_values)
+        _check_finite(frame, frame_values, sound)
         _check_ranges(frame, frame_values)
+        sound = frame
         yield frame, frame_values
 
 
-def _check_finite(frame: int, gaussians: Gaussians) -> None:
-    for name, values in vars(gaussians).items():
-        # A sum is finite only where all its terms are; the other way round it may overflow.
-        if torch.isfinite(values.sum()):
-            continue
-        broken = (~torch.isfinite(values)).sum().item()
-        if broken:
-            raise ExportError(
-                f"frame {frame}: expected finite {name}, found {broken} values that are not: the rollout "
-                "diverged; export the frames before it, or train longer"
-            )
+def _check_finite(frame: int, gaussians: Gaussians, sound: int | None) -> None:
+    """Check a frame's values; `sound` is the last frame before it, whose values were finite, if any."""
+    # A sum is finite only where all its terms are; the other way round it may overflow.
+    suspects = {name: values for name, values in vars(gaussians).items() if not values.sum().isfinite()}
+    broken = {name: int((~values.isfinite()).sum()) for name, values in suspects.items()}
+    found = [f"{name}, found {count} values that are not" for name, count in broken.items() if count]
+    if not found:
+        return
+    # The sequence does not say where it comes from: name what it can be, and what speaks for which.
+    cause = (
+        "the checkpoint or the motion holds such values, or the network made them at once: look at both"
+        if sound is None
+        else f"frame {sound} is finite: the motion holds such values there, or the network made them on the "
+        f"way: look at the motion, or export frames up to {sound}"
+    )
+    raise ExportError(f"frame {frame}: expected finite {'; finite '.join(found)}: {cause}")
 
 
 def _check_ranges(frame: int, gaussians: Gaussians) -> None:

@@ -291,6 +291,32 @@ def test_values_that_are_not_physical_are_refused_by_frame(make_sequence, tmp_pa
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("broken", "message"),
+    [
+        (
+            0,
+            "frame 1001: expected finite scales, found 15 values that are not; finite opacities, found 5 .*: "
+            "the checkpoint or the motion holds such values, or the network made them at once: look at both$",
+        ),
+        (
+            2,
+            "frame 1003: expected finite scales, .*: frame 1002 is finite: the motion holds such values there, "
+            "or the network made them on the way: look at the motion, or export frames up to 1002$",
+        ),
+    ],
+)
+def test_values_that_are_not_finite_are_told_without_blaming_one_cause(
+    make_sequence, tmp_path, broken, message
+):
+    def change(index, g):
+        spoilt = {"scales": g.scales / 0, "opacities": g.opacities * float("nan")}
+        return dataclasses.replace(g, **spoilt) if index == broken else g
+
+    with pytest.raises(ExportError, match=message):
+        write_usd(make_sequence(change=change), tmp_path / "a.usda", name="a")
+
+
 def test_gaussians_without_extent_get_a_little_one(make_sequence, tmp_path):
     sequence = make_sequence(change=lambda _, g: dataclasses.replace(g, scales=0 * g.scales))
     assert find_faults(write_usd(sequence, tmp_path / "a.usda", name="a")) == []

@@ -135,7 +135,7 @@ def test_a_ply_that_is_no_splat_is_refused_by_its_missing_properties(tmp_path):
     path = tmp_path / "points.ply"
     vertices = np.zeros(2, [("x", "f4"), ("y", "f4"), ("z", "f4")])
     plyfile.PlyData([plyfile.PlyElement.describe(vertices, "vertex")]).write(path)
-    with pytest.raises(ExportError, match=r"found no properties f_dc_0, .*opacity"):
+    with pytest.raises(ExportError, match=r"found a point cloud, which has no properties f_dc_0, .*opacity"):
         read_ply(path)
     with pytest.raises(ExportError, match="expected a PLY"):
         read_ply(tmp_path / "missing.ply")

@@ -12,7 +12,7 @@ from dsar.errors import ExportError
 from dsar.geometry.cameras import project
 from dsar.geometry.paths import CameraPath, turntable
 from dsar.types import Camera
-from dsar_exporters import read_usd_cameras, write_usd
+from dsar_exporters import list_usd_cameras, read_usd_cameras, write_usd
 
 FRAMES = range(1001, 1007)
 SIZE = (1920, 1080)
@@ -301,20 +301,69 @@ def test_without_a_resolution_it_is_asked_for(make_stage):
         read(stage, resolution=None)
 
 
-def test_a_moving_camera_of_another_rate_is_refused(make_stage):
+@pytest.mark.parametrize(("rate", "fps"), [(24.0, 30.0), (60.0, 25.0), (24000 / 1001, 25.0)])
+def test_a_camera_of_another_rate_is_taken_by_seconds_from_frame_1001(make_stage, caplog, rate, fps):
+    stage = make_stage(rate=rate)
+    place = UsdGeom.Xformable(add_camera(stage, "/shot")).GetOrderedXformOps()[0]
+    for time in (951, 1101):
+        place.Set(Gf.Vec3d(2 * (time - 1001) / rate * 100, 0, 500), time)
+    with caplog.at_level("INFO"):
+        (path,) = read(stage, fps=fps)
+    # Two metres a second, whatever counts the time; before the first frame too, where a shutter opens.
+    for frame in (1001, 1002, 1004, 1006, 1000.75, 1003.5):
+        center = (-path.at(frame).T_camera_world[:3, :3].T @ path.at(frame).T_camera_world[:3, 3])[0]
+        assert center == pytest.approx(2 * (frame - 1001) / fps, abs=1e-6)
+    (record,) = [record for record in caplog.records if "by seconds" in record.message]
+    assert f"moves at {rate:g} time codes a second, taken by seconds for {fps:g} frames" in record.message
+    assert record.message.endswith("frame 1001 is time code 1001")
+
+
+def test_a_turning_camera_of_another_rate_turns_and_is_not_sheared(make_stage):
+    stage = make_stage(up="Y", rate=24.0)
+    camera = UsdGeom.Xformable(UsdGeom.Camera.Define(stage, "/shot"))
+    turning = camera.AddTransformOp()
+    for time in range(1000, 1010):
+        turn = Gf.Matrix4d().SetRotate(Gf.Rotation(Gf.Vec3d(0, 1, 0), 20.0 * (time - 1001)))
+        turning.Set(turn, time)
+    (path,) = read(stage, fps=30.0)
+    for frame in FRAMES:
+        angle = np.radians(20.0 * (frame - 1001) * 24 / 30)
+        backwards = path.at(frame).T_camera_world[2, :3] * -1
+        expected = torch.tensor([np.sin(angle), 0.0, np.cos(angle)])
+        torch.testing.assert_close(backwards, expected.float(), rtol=0, atol=1e-6)
+
+
+def test_equal_rates_and_stages_that_say_none_count_frames(make_stage, caplog):
     stage = make_stage(rate=23.976)
     place = UsdGeom.Xformable(add_camera(stage, "/shot")).GetOrderedXformOps()[0]
     for frame in (1001, 1006):
         place.Set(Gf.Vec3d(frame, 0, 500), frame)
+    with caplog.at_level("INFO"):
+        assert read(stage, fps=24000 / 1001)[0].frames == tuple(range(1000, 1008))
+        assert read(stage, fps=None)[0].frames == tuple(range(1000, 1008))
+        # Who says nothing of a rate counts frames.
+        stage.GetRootLayer().ClearTimeCodesPerSecond()
+        assert read(stage, fps=30.0)[0].frames == tuple(range(1000, 1008))
+        stage.SetFramesPerSecond(60.0)
+        assert read(stage, fps=30.0)[0].frames[:2] == (1000.0, 1000.5)
+    assert [record.message.count("by seconds") for record in caplog.records] == [1]
+
+
+def test_only_chosen_cameras_are_judged_and_all_have_names(make_stage):
+    stage = make_stage()
+    add_camera(stage, "/world/shotCam")
+    _orthographic(add_camera(stage, "/world/top"))
+    _mirror(add_camera(stage, "/world/mirror"))
+    stage.Save()
+    path = Path(stage.GetRootLayer().realPath)
+    assert list_usd_cameras(path) == ["shotCam", "top", "mirror"]
+    how = {"frames": FRAMES, "resolution": SIZE}
+    (found,) = read_usd_cameras(path, **how, chosen=["shotCam"])
+    assert found.name == "shotCam"
     with pytest.raises(
-        ExportError, match=r"expected the motion.s 30 frames per second, found 23\.976 time codes"
+        ExportError, match=r"camera /world/top: .* orthographic .* choose others with --camera"
     ):
-        read(stage, fps=30.0)
-    assert read(stage, fps=24000 / 1001)[0].frames
-    assert read(stage, fps=None)[0].frames
-    # Who says nothing of a rate counts frames.
-    stage.GetRootLayer().ClearTimeCodesPerSecond()
-    assert read(stage, fps=30.0)[0].frames
+        read_usd_cameras(path, **how)
 
 
 def test_what_is_no_stage_with_cameras_is_refused(make_stage, tmp_path):
@@ -326,7 +375,7 @@ def test_what_is_no_stage_with_cameras_is_refused(make_stage, tmp_path):
         read_usd_cameras(tmp_path / "missing.usda", frames=FRAMES)
     (tmp_path / "wrong.usda").write_text("nothing")
     with pytest.raises(
-        ExportError, match=r"wrong\.usda: expected a USD file, found one that USD cannot open"
+        ExportError, match=r"wrong\.usda: expected a USD file, found one that starts with b'noth'"
     ):
         read_usd_cameras(tmp_path / "wrong.usda", frames=FRAMES)
 

@@ -212,6 +212,8 @@ def test_a_usd_core_without_validators_is_reported(asset, monkeypatch, caplog):
     monkeypatch.delattr(pxr, "UsdValidation", raising=False)
     refuse_faults(asset, [1001])
     assert "validators were not run" in caplog.text
+    asset.with_suffix(".payload.usdc").unlink()
+    assert any(re.match(r"CompositionError: .*avatar\.payload\.usdc", fault) for fault in find_faults(asset))
 
 
 @pytest.mark.parametrize("name", ["a.usda", "a.usdc", "a.ply", "a.spz", "a.compressed.ply"])

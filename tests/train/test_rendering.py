@@ -155,8 +155,8 @@ def test_a_farms_template_renders_the_same_bytes(trained, whole, tmp_path):
     assert contents(tmp_path / "exr") == whole
 
 
-def alphas(folder: Path, camera: str) -> np.ndarray:
-    with OpenEXR.File(str(folder / camera / f"avatar.{camera}.1004.exr")) as file:
+def alphas(folder: Path, camera: str, frame: int = 1004) -> np.ndarray:
+    with OpenEXR.File(str(folder / camera / f"avatar.{camera}.{frame}.exr")) as file:
         return file.channels()["RGBA"].pixels[..., 3].astype(float)
 
 
@@ -171,6 +171,44 @@ def test_cameras_from_our_usd_or_a_json_file_are_those_of_the_rig(trained, tiny_
     assert contents(tmp_path / "json") == contents(tmp_path / "rig")
     for camera in ("cam0", "cam1", "cam2", "cam3"):
         assert np.abs(alphas(tmp_path / "usd", camera) - alphas(tmp_path / "rig", camera)).max() < 2e-3
+
+
+def layout(path: Path, rate: float) -> Path:
+    """A film's layout: a camera that moves a metre a second, and an orthographic one for a plan."""
+    from pxr import Gf, Usd, UsdGeom
+
+    stage = Usd.Stage.CreateNew(str(path))
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    UsdGeom.SetStageUpAxis(stage, "Y")
+    stage.SetTimeCodesPerSecond(rate)
+    place = UsdGeom.Camera.Define(stage, "/cams/shotCam").AddTranslateOp()
+    for second in (-1, 1):
+        place.Set(Gf.Vec3d(second, 0.9, 3.5), 1001 + second * rate)
+    UsdGeom.Camera.Define(stage, "/cams/top").CreateProjectionAttr("orthographic")
+    stage.Save()
+    return path
+
+
+def test_a_layout_of_another_rate_is_drawn_by_seconds_and_its_other_cameras_left_alone(
+    trained, tmp_path, capsys
+):
+    shot = ("--frames", "1001,1004", "--camera", "shot*", "--res", "96", "54")
+    same, other = layout(tmp_path / "same.usda", 30.0), layout(tmp_path / "other.USDA", 24.0)
+    render(trained, tmp_path / "same", "--cameras", same, shot=shot)
+    render(trained, tmp_path / "other", "--cameras", other, shot=shot)
+    for frame in (1001, 1004):
+        found, expected = (alphas(tmp_path / name, "shotCam", frame) for name in ("other", "same"))
+        assert expected.sum() > 20
+        assert np.abs(found - expected).max() < 2e-3
+    assert np.abs(alphas(tmp_path / "same", "shotCam", 1001) - expected).max() > 0.05
+    capsys.readouterr()
+    for camera in ("all", "top"):
+        flags = ("--cameras", same, "--camera", camera, "--res", 96, 54, "--png", tmp_path / "png")
+        said = failure(capsys, "render", trained, *flags)
+        assert "same.usda, camera /cams/top: expected a perspective camera, found an orthographic one" in said
+        assert "choose others with --camera" in said
+    said = failure(capsys, "render", trained, *flags, "--camera", "side")
+    assert "expected all, turntable, orbit, dolly, or some of shotCam, top" in said
 
 
 def test_a_turntable_read_from_our_usd_is_the_one_we_render(trained, tmp_path):

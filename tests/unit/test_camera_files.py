@@ -10,7 +10,7 @@ import torch
 
 from dsar.data.capture import EMBEDDED_CAPTURE, open_capture
 from dsar.errors import ConfigError
-from dsar.geometry.camera_files import read_cameras_json, write_cameras_json
+from dsar.geometry.camera_files import list_cameras_json, read_cameras_json, write_cameras_json
 from dsar.geometry.cameras import look_at
 from dsar.geometry.paths import CameraPath
 from dsar.types import Camera
@@ -102,7 +102,7 @@ def test_cameras_of_another_rate_are_where_they_are_by_seconds(tmp_path, own, wa
     path = write_cameras_json([MOVING], tmp_path / "cameras.json")
     if own is not None:
         path.write_text(json.dumps({"fps": own, **json.loads(path.read_text())}))
-    (found,) = read_cameras_json(path, wanted)
+    (found,) = read_cameras_json(path, fps=wanted)
     assert found.frames == pytest.approx(keys, abs=1e-9)
     for key, expected in zip(found.frames, MOVING.cameras, strict=True):
         assert torch.equal(found.at(key).T_camera_world, expected.T_camera_world)
@@ -116,7 +116,7 @@ def test_a_rate_that_is_none_is_refused(tmp_path, rate):
     path = write_cameras_json([MOVING], tmp_path / "cameras.json")
     path.write_text(json.dumps({"fps": rate, **json.loads(path.read_text())}))
     with pytest.raises(ConfigError, match=r"cameras\.json: expected fps as a number > 0, found"):
-        read_cameras_json(path, 24.0)
+        read_cameras_json(path, fps=24.0)
 
 
 FLAT = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
@@ -166,6 +166,22 @@ def test_a_wrong_file_is_refused_by_name_and_place(rig, tmp_path, keys, value, m
     with pytest.raises(ConfigError, match=re.escape(message)) as caught:
         read_cameras_json(path)
     assert str(caught.value).startswith(str(path))
+
+
+def test_only_chosen_cameras_are_judged(rig, tmp_path):
+    path = spoilt(write_cameras_json(rig, tmp_path / "cameras.json"), "cameras", 0, "K", value="none")
+    assert list_cameras_json(path) == ["still", "moving", "zoom"]
+    assert [each.name for each in read_cameras_json(path, chosen={"zoom", "moving"})] == ["moving", "zoom"]
+    with pytest.raises(ConfigError, match="camera 0 still: expected K"):
+        read_cameras_json(path, chosen={"still"})
+
+
+@pytest.mark.parametrize("name", ["../../x", "/etc/x", "a/b", "..", "a\\b", ""])
+def test_a_name_that_would_be_a_path_is_refused(rig, tmp_path, name):
+    path = spoilt(write_cameras_json(rig, tmp_path / "cameras.json"), "cameras", 0, "name", value=name)
+    for read in (list_cameras_json, read_cameras_json):
+        with pytest.raises(ConfigError, match="expected a name of letters, digits and _"):
+            read(path)
 
 
 @pytest.mark.parametrize("contents", [b"{", b"\xff\xfe", b"[]", b"3", None])

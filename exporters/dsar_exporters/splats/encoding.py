@@ -4,7 +4,6 @@ No other room knows logarithms and logits.
 """
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -12,12 +11,10 @@ from jaxtyping import Float32
 
 from dsar.errors import ExportError
 from dsar.types import Gaussians
-from dsar_exporters.optional import require
 
 # A scale of zero or an opacity of one is infinite when encoded, which viewers show as giant splats.
 _MIN_SCALE = 1e-8
 _OPACITY_MARGIN = 1e-6
-_HEADER_BYTES = 65536
 
 
 @dataclass(frozen=True)
@@ -70,40 +67,3 @@ def padded(gaussians: Gaussians, sh_degree: int | None) -> Gaussians:
         )
     harmonics = torch.nn.functional.pad(gaussians.harmonics, (0, 0, 0, missing))
     return Gaussians(gaussians.means, gaussians.rotations, gaussians.scales, gaussians.opacities, harmonics)
-
-
-def _check_header(path: Path) -> None:
-    """Raise ExportError where a PLY's header does not end: gsply would look for its end forever."""
-    try:
-        with path.open("rb") as file:
-            ends = b"end_header" in file.read(_HEADER_BYTES)
-    except OSError as error:
-        raise ExportError(f"{path}: expected a compressed PLY, found {error}") from error
-    if not ends:
-        raise ExportError(f"{path}: expected a compressed PLY, found no end of its header")
-
-
-def read_splats(path: Path) -> Gaussians:
-    """Read a compressed PLY or an SPZ file as physical values in the file's own frame.
-
-    Raises:
-        ExportError: The file is missing or is none of them.
-        MissingDependencyError: gsply is not installed.
-    """
-    gsply = require("gsply", feature="compressed PLY and SPZ", package="gsply", extra="ply")
-    if path.suffix != ".spz":
-        _check_header(path)
-    try:
-        data = gsply.read_spz(path) if path.suffix == ".spz" else gsply.plyread(path)
-    except (OSError, ValueError, KeyError, IndexError, EOFError) as error:
-        raise ExportError(f"{path}: expected an SPZ or a compressed PLY, found {error}") from error
-    dc = data.sh0[:, None]
-    harmonics = dc if data.shN is None else np.concatenate([dc, data.shN.reshape(len(dc), -1, 3)], 1)
-    arrays = {
-        "means": data.means,
-        "log_scales": data.scales,
-        "rotations": data.quats,
-        "logits": data.opacities,
-        "harmonics": harmonics,
-    }
-    return decode(Encoded(**{name: np.array(values, np.float32) for name, values in arrays.items()}))

@@ -11,17 +11,13 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from jaxtyping import Float32
 
 from dsar.errors import ExportError
 from dsar.types import Gaussians, GaussianSequence
 from dsar_exporters.delivery import export
 from dsar_exporters.optional import require
-from dsar_exporters.splats.encoding import Encoded, decode, encode, padded
+from dsar_exporters.splats.encoding import Encoded, encode, padded
 from dsar_exporters.splats.files import SplatSequence
-
-_REST_COUNTS = (0, 9, 24, 45)
-"""Harmonics above the constant, three channels each, of degrees 0 to 3."""
 
 
 def write_ply(
@@ -62,11 +58,11 @@ class PlySequence(SplatSequence):
         """Raise where the degree is none, or plyfile is not installed."""
         if self.sh_degree is not None and self.sh_degree not in range(4):
             raise ExportError(f"PLY sh_degree: expected 0, 1, 2 or 3, found {self.sh_degree}")
-        _require_plyfile()
+        require_plyfile()
 
     def write_frame(self, draft: Path, gaussians: Gaussians, sequence: GaussianSequence, frame: int) -> None:
         """Write one frame."""
-        plyfile = _require_plyfile()
+        plyfile = require_plyfile()
         vertices = _records(encode(padded(gaussians, self.sh_degree)))
         element = plyfile.PlyElement.describe(vertices, "vertex")
         plyfile.PlyData([element], byte_order="<", comments=_comments(sequence, frame)).write(draft)
@@ -74,54 +70,15 @@ class PlySequence(SplatSequence):
     def estimated_bytes(self, first: Gaussians, frames: int) -> int:
         """Return how large the files will be; see `Output`."""
         count = first.harmonics.shape[1] if self.sh_degree is None else (self.sh_degree + 1) ** 2
-        return frames * len(first) * 4 * len(_property_names(count))
+        return frames * len(first) * 4 * len(property_names(count))
 
 
-def read_ply(path: Path) -> Gaussians:
-    """Read a 3D Gaussian Splatting PLY, whoever wrote it, as physical values in the file's own frame.
-
-    Properties are found by name, normals are ignored, and quaternions are normalised.
-
-    Raises:
-        ExportError: The file is missing, is no PLY, or lacks a property of a Gaussian.
-        MissingDependencyError: plyfile is not installed.
-    """
-    plyfile = _require_plyfile()
-    try:
-        vertices = plyfile.PlyData.read(path, mmap=False)["vertex"].data
-    except (OSError, KeyError, ValueError, plyfile.PlyParseError) as error:
-        raise ExportError(f"{path}: expected a PLY with an element 'vertex', found {error}") from error
-    names = vertices.dtype.names or ()
-    rest_names = [f"f_rest_{i}" for i in range(sum(field.startswith("f_rest_") for field in names))]
-    if len(rest_names) not in _REST_COUNTS:
-        raise ExportError(f"{path}: expected 0, 9, 24 or 45 properties f_rest_*, found {len(rest_names)}")
-    count = len(rest_names) // 3 + 1
-    if missing := [field for field in _property_names(count) if field not in names and field[0] != "n"]:
-        raise ExportError(f"{path}: expected a Gaussian splat PLY, found no properties {', '.join(missing)}")
-
-    def columns(*fields: str) -> Float32[np.ndarray, "n c"]:
-        return np.stack([vertices[field] for field in fields], -1).astype(np.float32)
-
-    harmonics = columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None]
-    if rest_names:
-        rest = columns(*rest_names).reshape(-1, 3, count - 1).transpose(0, 2, 1)
-        harmonics = np.ascontiguousarray(np.concatenate([harmonics, rest], 1))
-    return decode(
-        Encoded(
-            means=columns("x", "y", "z"),
-            log_scales=columns("scale_0", "scale_1", "scale_2"),
-            rotations=columns("rot_0", "rot_1", "rot_2", "rot_3"),
-            logits=columns("opacity")[:, 0],
-            harmonics=harmonics,
-        )
-    )
-
-
-def _require_plyfile() -> Any:
+def require_plyfile() -> Any:
+    """Return the library of PLY files, or raise MissingDependencyError."""
     return require("plyfile", feature="PLY", package="plyfile", extra="ply")
 
 
-def _property_names(harmonics_count: int) -> list[str]:
+def property_names(harmonics_count: int) -> list[str]:
     """Return the property names in file order for 1, 4, 9 or 16 harmonics."""
     groups = {"f_dc": 3, "f_rest": 3 * (harmonics_count - 1)}
     names = ["x", "y", "z", "nx", "ny", "nz"]
@@ -141,7 +98,7 @@ def _records(encoded: Encoded) -> np.ndarray:
         encoded.log_scales,
         encoded.rotations,
     ]
-    dtype = np.dtype([(field, "<f4") for field in _property_names(count)])
+    dtype = np.dtype([(field, "<f4") for field in property_names(count)])
     return np.concatenate(columns, 1).astype("<f4", copy=False).reshape(-1).view(dtype)
 
 

@@ -4,7 +4,7 @@ import logging
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -75,19 +75,34 @@ def write_usd(
     return path
 
 
+def list_usd_cameras(path: Path) -> list[str]:
+    """Return the names by which `read_usd_cameras` calls the cameras of a USD stage, whatever these are.
+
+    Raises:
+        ExportError: It is no USD file or has no camera.
+        MissingDependencyError: usd-core is not installed.
+    """
+    require("pxr.UsdGeom", feature="USD", package="usd-core>=26.3", extra="usd")
+    from dsar_exporters.usd.camera_reader import list_cameras
+
+    return list_cameras(path)
+
+
 def read_usd_cameras(
     path: Path,
     *,
     frames: Sequence[int],
     resolution: tuple[int, int] | None = None,
     fps: float | None = None,
+    chosen: Collection[str] | None = None,
 ) -> list[CameraPath]:
-    """Read every camera of a USD stage, ours or anyone's, in the stage's order.
+    """Read cameras of a USD stage, ours or anyone's, in the stage's order.
 
     What moves, be it the camera, a parent or the lens, is keyed at the frames and their neighbours; all else
-    is at rest. Time codes are frame numbers. The stage's unit and up axis are converted to ours, and scale is
-    taken off. A camera is called as its prim, in files of Blender and Maya that give it two as its object,
-    and led by its parent's name where that is not unique.
+    is at rest. Time codes are frame numbers; where the stage has another rate than these, frame 1001, the
+    first, is time code 1001, and what follows and precedes it is taken by seconds. The stage's unit and up
+    axis are converted to ours, and scale is taken off. A camera is called as its prim, in files of Blender
+    and Maya that give it two as its object, and led by its parent's name where that is not unique.
 
     Args:
         path: A `.usda`, `.usdc`, `.usd` or `.usdz`; all its payloads are loaded.
@@ -95,17 +110,18 @@ def read_usd_cameras(
         resolution: Width and height of the pictures; without it those that our own files note. Where their
             aspect is, to a hundredth, the aperture's or the note's, the picture shows the aperture; else the
             aperture's width is the picture's and pixels are square, as with `usdrecord`.
-        fps: Frames per second of the frame numbers.
+        fps: Frames per second of the frame numbers; None: the stage's.
+        chosen: Names of the cameras to read; the others may be of a kind that we refuse. None: every one.
 
     Raises:
-        ExportError: It is no USD file or has no camera; a camera has no resolution, is not perspective,
-            mirrored or sheared, or moves at another rate than `fps`.
+        ExportError: It is no USD file or has no camera; one to read has no resolution, is not perspective,
+            or is mirrored or sheared.
         MissingDependencyError: usd-core is not installed.
     """
     require("pxr.UsdGeom", feature="USD", package="usd-core>=26.3", extra="usd")
     from dsar_exporters.usd.camera_reader import read_cameras
 
-    return read_cameras(path, frames, resolution, fps)
+    return read_cameras(path, frames, resolution, fps, chosen)
 
 
 def read_usd_projections(

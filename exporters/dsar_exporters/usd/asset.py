@@ -206,7 +206,7 @@ class AssetWriter:
                 sequence.binding, sequence.frame_numbers, sequence.fps, width=width, height=height
             )
             place = define_camera(self._data, f"/{TURNTABLE}", circling.cameras[0])
-            for frame, camera in zip(circling.frames, circling.cameras, strict=True):
+            for frame, camera in zip(sequence.frame_numbers, circling.cameras, strict=True):
                 self._layer.sample(place, frame, placement(camera))
             self._as_data(f"/{TURNTABLE}")
             prim = self._stage.DefinePrim(scope.GetPath().AppendChild(TURNTABLE))

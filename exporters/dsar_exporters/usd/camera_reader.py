@@ -7,19 +7,22 @@ Imports pxr: only `dsar_exporters.usd` imports this module, when it reads.
 # pyright: reportAttributeAccessIssue=false
 
 import logging
+import math
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from pxr import Gf, Tf, Usd, UsdGeom
+from pxr import Gf, Usd, UsdGeom
 
 from dsar.errors import ExportError
-from dsar.geometry.paths import CameraPath
+from dsar.geometry.paths import START_FRAME, CameraPath
+from dsar.geometry.rates import exact_rate, same_rate
 from dsar.geometry.rotations import nearest_rotation
 from dsar.types import Camera
+from dsar_exporters.usd.stages import open_stage
 
 _logger = logging.getLogger(__name__)
 
@@ -28,29 +31,45 @@ _OBJECT_NAME = "userProperties:blender:object_name"
 _FITS = 0.01
 """How far the aspects of aperture and picture may differ and mean the same: rounding to whole pixels."""
 _RIGID_TOLERANCE = 1e-4
-_SAME_RATE = 2e-4
-"""Relative: 23.976 is 24000/1001."""
 _Y_UP_FROM_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 _STATE = 5
 """Numbers of a lens, before the sixteen of its place."""
 
 
+def list_cameras(path: Path) -> list[str]:
+    """Return the names of a stage's cameras; see `dsar_exporters.usd.list_usd_cameras`."""
+    return list(_find(path)[1])
+
+
 def read_cameras(
-    path: Path, frames: Sequence[int], resolution: tuple[int, int] | None, fps: float | None
+    path: Path,
+    frames: Sequence[int],
+    resolution: tuple[int, int] | None,
+    fps: float | None,
+    chosen: Collection[str] | None,
 ) -> list[CameraPath]:
     """Read cameras; see `dsar_exporters.usd.read_usd_cameras`."""
-    stage = _open(path)
+    stage, prims = _find(path)
+    if not stage.HasAuthoredMetadata("metersPerUnit"):
+        _logger.warning("%s: says no metersPerUnit; read in centimetres, as USD has it", path)
+    return [
+        _CameraReader(prim, name, f"{path}, camera {prim.GetPath()}").read(frames, resolution, fps)
+        for name, prim in prims.items()
+        if chosen is None or name in chosen
+    ]
+
+
+def _find(path: Path) -> tuple[Usd.Stage, dict[str, Usd.Prim]]:
+    """Return a stage, which prims do not keep open, and its cameras in order by the names we give them."""
+    if not path.is_file():
+        raise ExportError(f"{path}: expected a USD file with cameras, found none: give its path")
+    stage = open_stage(path)
     _mend_types(stage)
     every = Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies())
     prims = [prim for prim in every if prim.IsA(UsdGeom.Camera)]
     if not prims:
         raise ExportError(f"{path}: expected cameras, found none: export them too, or name another file")
-    if not stage.HasAuthoredMetadata("metersPerUnit"):
-        _logger.warning("%s: says no metersPerUnit; read in centimetres, as USD has it", path)
-    return [
-        _CameraReader(prim, name, f"{path}, camera {prim.GetPath()}").read(frames, resolution, fps)
-        for prim, name in zip(prims, _names(prims), strict=True)
-    ]
+    return stage, dict(zip(_names(prims), prims, strict=True))
 
 
 class _CameraReader:
@@ -71,30 +90,45 @@ class _CameraReader:
     def read(
         self, frames: Sequence[int], resolution: tuple[int, int] | None, fps: float | None
     ) -> CameraPath:
-        """Return the camera: at rest, or keyed at the frames and their neighbours."""
+        """Return the camera: at rest, or keyed at frames and their neighbours, or around these."""
         size = self._size(resolution)
+        ratio = self._ratio(fps)
         keys = sorted({frame + step for frame in frames for step in (-1, 0, 1)})
+        if ratio != 1:
+            # The stage's own time codes around the keys: between them USD may interpolate matrices, which
+            # shears what turns, and a path turns.
+            times = [START_FRAME + (key - START_FRAME) / ratio for key in keys]
+            keys = sorted({math.floor(time) + step for time in times for step in (0, 1)})
         states = self._states(keys[:1])
-        if self._may_move() and self._moves_with(keys, fps):
-            states = self._states(keys)
-        cameras = tuple(self._camera(state, size) for state in states)
-        return CameraPath(cameras, tuple(keys) if len(cameras) > 1 else ())
+        if not (self._may_move() and self._moves_at(keys)):
+            return CameraPath((self._camera(states[0], size),))
+        cameras = tuple(self._camera(state, size) for state in self._states(keys))
+        if ratio == 1:
+            return CameraPath(cameras, tuple(keys))
+        _logger.info(
+            "%s: moves at %g time codes a second, taken by seconds for %g frames: frame %d is time code %d",
+            *(self._where, _rate(self._prim.GetStage()), fps, START_FRAME, START_FRAME),
+        )
+        return CameraPath(cameras, tuple(START_FRAME + (key - START_FRAME) * ratio for key in keys))
+
+    def _ratio(self, fps: float | None) -> float:
+        """Return how many frames pass while a time code does; 1 where the stage says nothing of a rate."""
+        rate = _rate(self._prim.GetStage())
+        if rate is None or fps is None or same_rate(rate, fps):
+            return 1.0
+        if not 0 < rate < math.inf:
+            raise ExportError(f"{self._where}: expected time codes per second > 0, found {rate:g}: set them")
+        return float(exact_rate(fps) / exact_rate(rate))
 
     def _may_move(self) -> bool:
         return any(attribute.ValueMightBeTimeVarying() for attribute in self._lens) or any(
             each.TransformMightBeTimeVarying() for each in self._placed
         )
 
-    def _moves_with(self, keys: Sequence[int], fps: float | None) -> bool:
-        """Return whether the camera moves at the keys; complain where it does so at others, or at a rate."""
+    def _moves_at(self, keys: Sequence[int]) -> bool:
+        """Return whether the camera moves at some time codes; say so where it does at others alone."""
         if _constant(self._states([*keys, *self._sample_times()])):
             return False
-        rate = _rate(self._prim.GetStage())
-        if rate is not None and fps is not None and abs(rate / fps - 1) > _SAME_RATE:
-            raise ExportError(
-                f"{self._where}: expected the motion's {fps:g} frames per second, found {rate:g} time codes "
-                f"per second, and the camera moves: export it at {fps:g} frames per second"
-            )
         if not _constant(self._states(keys)):
             return True
         times = self._sample_times()
@@ -112,7 +146,7 @@ class _CameraReader:
         if any(view.projection != Gf.Camera.Perspective for view in views):
             raise ExportError(
                 f"{self._where}: expected a perspective camera, found an orthographic one: make it "
-                "perspective, or deactivate or delete it"
+                "perspective, or choose others with --camera NAME"
             )
         return np.array(
             [
@@ -187,20 +221,6 @@ class _CameraReader:
         result = np.eye(4)
         result[:3, :3], result[:3, 3] = rotation, -rotation @ center
         return result
-
-
-def _open(path: Path) -> Usd.Stage:
-    if not path.is_file():
-        raise ExportError(f"{path}: expected a USD file with cameras, found none: give its path")
-    try:
-        # With payloads: our own assets keep the cameras that move in one.
-        return Usd.Stage.Open(str(path))
-    except Tf.ErrorException as error:
-        reasons = [each.commentary.strip() for each in error.args if hasattr(each, "commentary")]
-        raise ExportError(
-            f"{path}: expected a USD file, found one that USD cannot open: {(reasons or [str(error)])[0]}: "
-            "export it again"
-        ) from error
 
 
 def _mend_types(stage: Usd.Stage) -> None:

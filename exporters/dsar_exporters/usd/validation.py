@@ -13,10 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pxr import Tf, Usd, UsdGeom, UsdVol
+from pxr import Sdf, Tf, Usd, UsdGeom, UsdVol
 
 from dsar.errors import ExportError
 from dsar_exporters.usd.particles import EXTENT_SIGMAS, reach_of
+from dsar_exporters.usd.stages import diagnostics_held, open_stage, reason
 
 _logger = logging.getLogger(__name__)
 
@@ -40,8 +41,8 @@ def refuse_faults(path: Path, frames: Sequence[int]) -> None:
     faults = list(usd_faults(path, frames))
     if faults:
         raise ExportError(
-            f"{path.name}: the written file has {len(faults)} faults: {'; '.join(faults[:3])}: the exporter "
-            "is wrong, please report it"
+            f"{path.name}: expected a sound file, found {len(faults)} faults in what was just written: "
+            f"{'; '.join(faults[:3])}: our writer or this usd-core is at fault, please report both"
         )
 
 
@@ -49,29 +50,46 @@ def usd_faults(path: Path, frames: Sequence[int] | None = None) -> Iterator[str]
     """Yield what is wrong with a USD file, in words.
 
     Args:
-        path: Any USD file; every point instancer and Gaussian field that it draws is checked, in all levels
-            of detail of the default prim. Of instancers that are not of Gaussians, what holds for all.
+        path: Any USD file; every point instancer and Gaussian field that it draws is checked, through
+            references, payloads and instances (a prototype once), in all levels of detail of the default
+            prim. Of instancers that are not of Gaussians, what holds for all.
         frames: Check these frames, and open no file that they do not need; None: all time samples.
 
     Raises:
         ExportError: It cannot be opened.
     """
+    with diagnostics_held():
+        stage = open_stage(path)
+        yield from _validator_errors(stage, whole=frames is None)
+        found = False
+        for selected in _each_lod(stage):
+            for prim, others in _drawn(stage):
+                found = True
+                where = f"{prim.GetPath()}{f' and {others} instances more' if others else ''}{selected}"
+                yield from _prim_faults(prim, where, frames)
+        if not found:
+            yield "no point instancer and no Gaussian field: nothing in it is ours to check"
+
+
+def _drawn(stage: Usd.Stage) -> Iterator[tuple[Usd.Prim, int]]:
+    """Yield the prims to check, each once, and how many instances more of it the stage draws."""
+    groups: dict[Sdf.Path, list[Usd.Prim]] = {}
+    for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
+        if prim.IsA(UsdGeom.PointInstancer) or prim.IsA(UsdVol.ParticleField3DGaussianSplat):
+            source = prim.GetPrimInPrototype() if prim.IsInstanceProxy() else prim
+            groups.setdefault(source.GetPath(), []).append(prim)
+    for prims in groups.values():
+        yield prims[0], len(prims) - 1
+
+
+def _prim_faults(prim: Usd.Prim, where: str, frames: Sequence[int] | None) -> Iterator[str]:
     try:
-        stage = Usd.Stage.Open(str(path))
+        if prim.IsA(UsdGeom.PointInstancer):
+            yield from _instancer_faults(UsdGeom.PointInstancer(prim), where, frames)
+        else:
+            yield from _splat_faults(UsdVol.ParticleField3DGaussianSplat(prim), where, frames)
     except Tf.ErrorException as error:
-        raise ExportError(f"{path}: expected a USD file, found one that cannot be opened") from error
-    yield from _validator_errors(stage, whole=frames is None)
-    found = False
-    for selected in _each_lod(stage):
-        for prim in stage.Traverse():
-            if prim.IsA(UsdGeom.PointInstancer):
-                found = True
-                yield from _instancer_faults(UsdGeom.PointInstancer(prim), selected, frames)
-            elif prim.IsA(UsdVol.ParticleField3DGaussianSplat):
-                found = True
-                yield from _splat_faults(UsdVol.ParticleField3DGaussianSplat(prim), selected, frames)
-    if not found:
-        yield "no point instancer and no Gaussian field: nothing in it is ours to check"
+        yield f"{where}: expected values that USD can read, found: {reason(error)}"
 
 
 def _validator_errors(stage: Usd.Stage, *, whole: bool) -> Iterator[str]:
@@ -79,11 +97,17 @@ def _validator_errors(stage: Usd.Stage, *, whole: bool) -> Iterator[str]:
         from pxr import UsdValidation
     except ImportError:
         _logger.warning("USD's own validators were not run: this usd-core has no UsdValidation")
+        yield from (f"CompositionError: {error}" for error in stage.GetCompositionErrors())
         return
     validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
     if not whole:
         validators = [each for each in validators if each.GetMetadata().name not in _OPEN_EVERYTHING]
-    for error in UsdValidation.ValidationContext(validators).Validate(stage):
+    try:
+        errors = UsdValidation.ValidationContext(validators).Validate(stage)
+    except Tf.ErrorException as error:
+        yield f"expected files that USD can open, found one that it depends on broken: {reason(error)}"
+        return
+    for error in errors:
         yield f"{error.GetName()}: {error.GetMessage()}"
 
 
@@ -115,13 +139,12 @@ class _Fields:
 
 
 def _instancer_faults(
-    prim: UsdGeom.PointInstancer, selected: str, frames: Sequence[int] | None
+    prim: UsdGeom.PointInstancer, where: str, frames: Sequence[int] | None
 ) -> Iterator[str]:
-    where = f"{prim.GetPath()}{selected}"
     # Without it, instances are whatever their prototypes are.
     sigmas = prim.GetPrim().GetCustomDataByKey("dsar:sigmaScale")
     prototypes = len(prim.GetPrototypesRel().GetTargets())
-    for time in _times(prim.GetPositionsAttr(), frames):
+    for time in _times(prim.GetPrim(), frames):
         at = _at(where, time)
         indices = np.array(prim.GetProtoIndicesAttr().Get(time) or [], np.int64)
         count = len(indices)
@@ -143,18 +166,15 @@ def _instancer_faults(
 
 
 def _splat_faults(
-    prim: UsdVol.ParticleField3DGaussianSplat, selected: str, frames: Sequence[int] | None
+    prim: UsdVol.ParticleField3DGaussianSplat, where: str, frames: Sequence[int] | None
 ) -> Iterator[str]:
-    where = f"{prim.GetPath()}{selected}"
-
     def value(name: str, time: Usd.TimeCode) -> Any:
         """Return a field in the precision that readers prefer."""
         full = getattr(prim, f"Get{name}Attr")().Get(time)
         return getattr(prim, f"Get{name}hAttr")().Get(time) if full is None else full
 
-    positions = prim.GetPositionsAttr()
     degree = prim.GetRadianceSphericalHarmonicsDegreeAttr().Get()
-    for time in _times(positions if positions.HasAuthoredValue() else prim.GetPositionshAttr(), frames):
+    for time in _times(prim.GetPrim(), frames):
         at, count = _at(where, time), len(value("Positions", time) or ())
         fields = _Fields(
             positions=_array(value("Positions", time)),
@@ -195,7 +215,9 @@ def _field_faults(fields: _Fields, count: int, at: str, *, gaussians: bool) -> I
             yield f"{at}: expected unit quaternions, found lengths {lengths.min():g} to {lengths.max():g}"
     if fields.extent is None:
         yield f"{at}: expected an extent, found none: applications could not frame or cull it"
-    if gaussians:
+    elif fields.extent.shape != (2, 3) or not np.isfinite(fields.extent).all():
+        yield f"{at}: expected an extent of two finite corners, found {fields.extent.tolist()}"
+    elif gaussians:
         yield from _reach_faults(fields, at)
 
 
@@ -250,10 +272,14 @@ def _id_faults(ids: Any, count: int, where: str) -> Iterator[str]:
         yield f"{where}: expected each id once, found {count - len(set(ids))} again"
 
 
-def _times(attribute: Usd.Attribute, frames: Sequence[int] | None) -> Sequence[Usd.TimeCode]:
-    """Return the times to check: some frames, those of all samples, or the default."""
+def _times(prim: Usd.Prim, frames: Sequence[int] | None) -> Sequence[Usd.TimeCode]:
+    """Return the times to check: some frames, those of any sample, or the default."""
     # The samples of value clips are asked for only if need be: that opens every clip.
-    found = attribute.GetTimeSamples() if frames is None else frames
+    found = frames
+    if found is None:
+        found = sorted(
+            {time for attribute in prim.GetAuthoredAttributes() for time in attribute.GetTimeSamples()}
+        )
     return [Usd.TimeCode(time) for time in found] or [Usd.TimeCode.Default()]
 
 
