@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 from dsar.cli.common import OnRun, capture_sequence
 from dsar.errors import ConfigError
+from dsar.geometry.rates import exact_rate, parse_rate, same_rate
 from dsar.types import Camera, GaussianSequence, Motion
 
 if TYPE_CHECKING:
@@ -16,10 +17,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Performance:
-    """An avatar, a motion at its rate, and where both come from."""
+    """An avatar, a motion at its rate and at that of the delivery, and where they come from."""
 
     avatar: "Avatar"
     motion: Motion
+    delivered: Motion
+    """The same at the rate of the frames that are written."""
     cameras: tuple[Camera, ...]
     """Those of the capture."""
     provenance: dict[str, str]
@@ -28,7 +31,8 @@ class Performance:
         """Return the Gaussians of some frames, all by default."""
         from dsar.avatar import roll_out
 
-        return roll_out(self.avatar, self.motion, frames=frames, provenance=self.provenance)
+        given = {"delivered": self.delivered, "provenance": self.provenance}
+        return roll_out(self.avatar, self.motion, frames=frames, **given)
 
 
 @dataclass(frozen=True)
@@ -39,10 +43,12 @@ class Drive(OnRun):
     """An AMASS/SMPL-X .npz or .bvh file, a sequence of the run's capture, or its split `test` or `train`."""
     up: Literal["y", "z"] | None = None
     """Which axis is up in the motion file; default: found from how people stand in it."""
-    motion_fps: float | None = None
+    motion_fps: str | None = None
     """Frames per second of the motion file, where it says none or a wrong one."""
+    fps: str | None = None
+    """Frames per second to deliver, e.g. 24, 23.976 or 24000/1001; default: the avatar's."""
     frames: str | None = None
-    """Frame numbers from 1001 on, e.g. 1001-1100x2; default: all."""
+    """Frame numbers from 1001 on, of those delivered, e.g. 1001-1100x2; default: all."""
 
     def wanted_frames(self) -> list[int] | None:
         """Return the frames that are asked for, None for all."""
@@ -60,6 +66,7 @@ class Drive(OnRun):
         from dsar.training.checkpoint import Run, load_checkpoint
 
         self.check_device()
+        fps = None if self.fps is None else parse_rate(self.fps)
         avatar, config, provenance = load_checkpoint(Run(self.chosen_run()))
         capture = capture_of(config)
         name = capture_sequence(capture, self.motion)
@@ -67,15 +74,18 @@ class Drive(OnRun):
             self._refuse_file_flags(name)
             motion = capture.motions[name]
         else:
-            motion = read_motion(Path(self.motion), avatar.body, up=self.up, fps=self.motion_fps)
+            rate = None if self.motion_fps is None else parse_rate(self.motion_fps, "--motion-fps")
+            motion = read_motion(Path(self.motion), avatar.body, up=self.up, fps=rate)
             judge_motion(avatar.body, motion)
-        if motion.fps != avatar.fps:
-            motion = resample(motion, avatar.fps)
+        provenance["motion_hash"] = _hash(motion)
+        driven = delivered = motion if same_rate(motion.fps, avatar.fps) else resample(motion, avatar.fps)
+        if fps is not None and not same_rate(fps, avatar.fps):
+            delivered = resample(motion, fps)
+            provenance["fps"] = str(exact_rate(fps))
         if name is None:
             known = [capture.motions[trained] for trained in capture.splits["train"]]
-            report_novelty(avatar.body, motion, known, START_FRAME)
-        provenance["motion_hash"] = _hash(motion)
-        return Performance(avatar, motion, tuple(capture.cameras), provenance)
+            report_novelty(avatar.body, delivered, known, START_FRAME)
+        return Performance(avatar, driven, delivered, tuple(capture.cameras), provenance)
 
     def _refuse_file_flags(self, sequence: str) -> None:
         """Raise ConfigError where flags for motion files stand beside a sequence of the capture."""
@@ -87,8 +97,8 @@ class Drive(OnRun):
 
 
 def _hash(motion: Motion) -> str:
-    """Return a hash of the poses: a file may change and keep its name."""
-    digest = hashlib.sha256()
+    """Return a hash of the poses and their rate: a file may change and keep its name."""
+    digest = hashlib.sha256(repr(motion.fps).encode())
     for values in (motion.rotations, motion.translations):
         digest.update(values.cpu().contiguous().numpy().tobytes())
     return digest.hexdigest()[:16]

@@ -216,13 +216,13 @@ class Render(Drive):
             return []
         if self.cameras is None:
             return [CameraPath((camera,)) for camera in performance.cameras if camera.name in chosen]
+        fps = performance.delivered.fps
         if _is_usd(self.cameras):
             from dsar_exporters import read_usd_cameras
 
-            fps = performance.motion.fps
             how = {"frames": frames, "resolution": self.res, "fps": fps}
             return read_usd_cameras(self.cameras, **how, chosen=chosen)
-        return read_cameras_json(self.cameras, chosen=chosen)
+        return read_cameras_json(self.cameras, fps=fps, chosen=chosen)
 
     def check_together(self, paths: Sequence[CameraPath]) -> None:
         """Check what the chosen cameras have to have in common."""

@@ -20,7 +20,7 @@ from dsar.data.poses import read_arrays, read_poses, read_rate
 from dsar.data.retarget import Clip, body_places, bones_of, leg_length, retarget, standing_rest
 from dsar.data.skeletons import Figure, find_figure
 from dsar.errors import MotionError
-from dsar.geometry.rates import same_rate
+from dsar.geometry.rates import exact_rate, same_rate
 from dsar.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
 from dsar.types import Body, Motion
 
@@ -166,8 +166,8 @@ def resample(motion: Motion, fps: float) -> Motion:
         raise MotionError(f"motion {motion.name}: cannot be resampled to {fps} frames per second")
     if same_rate(motion.fps, fps):
         return dataclasses.replace(motion, fps=fps)
-    last, step = len(motion) - 1, motion.fps / fps
-    # A millionth of a frame forgives the rounding of e.g. 29.97 / 119.88.
+    last, step = len(motion) - 1, float(exact_rate(motion.fps) / exact_rate(fps))
+    # A millionth of a frame forgives the rounding of e.g. 30 / 23.976.
     times = torch.arange(int(last / step + 1e-6) + 1, dtype=torch.float64) * step
     before = times.floor().long().clamp(max=last)
     after = (before + 1).clamp(max=last)

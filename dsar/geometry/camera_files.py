@@ -1,6 +1,8 @@
 """Cameras in JSON, as our captures hold them (docs/capture-format.md), and such that move."""
 
 import json
+import logging
+import math
 import re
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
@@ -12,11 +14,14 @@ from torch import Tensor
 
 from dsar.drafts import replacing
 from dsar.errors import ConfigError
-from dsar.geometry.paths import CameraPath
+from dsar.geometry.paths import START_FRAME, CameraPath
+from dsar.geometry.rates import exact_rate, same_rate
 from dsar.types import Camera
 
+_logger = logging.getLogger(__name__)
+
 _IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
-_FRAME = re.compile(r"-?\d+", re.ASCII)
+_FRAME = re.compile(r"-?\d+(\.\d+)?", re.ASCII)
 _RIGID_TOLERANCE = 1e-4
 
 
@@ -29,25 +34,36 @@ def list_cameras_json(path: Path) -> list[str]:
     return list(_by_name(_load(path), path))
 
 
-def read_cameras_json(path: Path, *, chosen: Collection[str] | None = None) -> list[CameraPath]:
+def read_cameras_json(
+    path: Path, *, fps: float | None = None, chosen: Collection[str] | None = None
+) -> list[CameraPath]:
     """Read cameras, in the file's order; a `capture.json` is such a file.
 
     `{"cameras": [{"name": ..., "K": ..., "T_camera_world": ..., "width": ..., "height": ...}]}`, with
     `"frames": {"1001": {"T_camera_world": ..., "K": ...}}` where a camera moves. What a frame does not say it
-    takes from the camera.
+    takes from the camera. With `"fps": 24.0` beside `"cameras"` the file's frames are those of that rate,
+    and are taken by seconds from frame 1001 on, which is the first at every rate.
 
     Args:
         path: The file.
+        fps: Frames per second of the frame numbers that are wanted; None: the file's.
         chosen: Names of the cameras to read; others may be malformed. None: every one.
 
     Raises:
-        ConfigError: It cannot be read, or a camera is incomplete or malformed.
+        ConfigError: It cannot be read, or its rate or a camera is incomplete or malformed.
     """
-    return [
+    record = _load(path)
+    cameras = [
         _read_path(entry, where)
-        for name, (where, entry) in _by_name(_load(path), path).items()
+        for name, (where, entry) in _by_name(record, path).items()
         if chosen is None or name in chosen
     ]
+    own = _rate(record, str(path))
+    if own is None or fps is None or same_rate(own, fps):
+        return cameras
+    if any(camera.frames for camera in cameras):
+        _logger.info("%s: its cameras move at %g frames a second; taken at %g by seconds", path, own, fps)
+    return [_resampled(camera, float(exact_rate(fps) / exact_rate(own))) for camera in cameras]
 
 
 def _load(path: Path) -> Mapping[str, Any]:
@@ -114,7 +130,7 @@ def _written(path: CameraPath) -> str:
         entry = {"T_camera_world": camera.T_camera_world.tolist()}
         if not torch.equal(camera.K, first.K):
             entry["K"] = camera.K.tolist()
-        frames.append(f'  "{frame}": {json.dumps(entry)}')
+        frames.append(f'  "{frame:.17g}": {json.dumps(entry)}')
     return f'{json.dumps(record)[:-1]}, "frames": {{\n' + ",\n".join(frames) + "\n}}"
 
 
@@ -126,22 +142,36 @@ def _read_path(entry: Mapping[str, Any], where: str) -> CameraPath:
         return CameraPath((_read_camera(entry, name, size, where),))
     keyed = _keyed(frames, where)
     cameras = [
-        _read_camera({**entry, **values}, name, size, f"{where}, frame {frame}")
+        _read_camera({**entry, **values}, name, size, f"{where}, frame {frame:.12g}")
         for frame, values in keyed.items()
     ]
     return CameraPath(tuple(cameras), tuple(keyed))
 
 
-def _keyed(frames: object, where: str) -> dict[int, Mapping[str, Any]]:
+def _rate(record: Mapping[str, Any], where: str) -> float | None:
+    """Return the frames per second of a file's frame numbers, if it says so."""
+    rate = record.get("fps")
+    if rate is not None and (type(rate) not in (int, float) or not 0 < rate < math.inf):
+        raise ConfigError(f"{where}: expected fps as a number > 0, found {_shown(rate)}: correct it")
+    return None if rate is None else float(rate)
+
+
+def _resampled(path: CameraPath, ratio: float) -> CameraPath:
+    """Return the camera with its keys at the same seconds of another rate, `ratio` times its own."""
+    frames = tuple(START_FRAME + (frame - START_FRAME) * ratio for frame in path.frames)
+    return CameraPath(path.cameras, frames)
+
+
+def _keyed(frames: object, where: str) -> dict[float, Mapping[str, Any]]:
     """Return what a camera's `frames` say, by ascending frame number."""
-    keyed: dict[int, Mapping[str, Any]] = {}
+    keyed: dict[float, Mapping[str, Any]] = {}
     for key, values in frames.items() if isinstance(frames, dict) else ():
-        if not _FRAME.fullmatch(key) or int(key) in keyed or not isinstance(values, dict):
+        if not _FRAME.fullmatch(key) or float(key) in keyed or not isinstance(values, dict):
             raise ConfigError(
                 f'{where}: expected frames as {{"1001": {{"T_camera_world": ...}}}}, each number once, found '
                 f"{key!r}: {_shown(values)}: correct it"
             )
-        keyed[int(key)] = values
+        keyed[float(key)] = values
     if not keyed:
         raise ConfigError(
             f"{where}: expected frames by number, at least one, found {_shown(frames)}: leave out `frames` "

@@ -13,6 +13,7 @@ from jaxtyping import UInt8
 
 from dsar.drafts import quoted_error, replacing
 from dsar.errors import ExportError, MissingDependencyError
+from dsar.geometry.rates import exact_rate
 
 
 def write_mp4(images: Iterable[UInt8[np.ndarray, "h w 3"]], path: Path, *, fps: float) -> Path:
@@ -24,7 +25,7 @@ def write_mp4(images: Iterable[UInt8[np.ndarray, "h w 3"]], path: Path, *, fps: 
     Args:
         images: Frames of one size, in order.
         path: The file; folders are made if missing.
-        fps: Frames per second.
+        fps: Frames per second; NTSC rates such as 23.976 are written as their exact fractions.
 
     Raises:
         ExportError: There are no images, their sizes differ, or ffmpeg fails.
@@ -78,7 +79,7 @@ def _find_ffmpeg() -> str:
 
 def _encoder_arguments(image: UInt8[np.ndarray, "h w 3"], path: Path, fps: float) -> list[str]:
     height, width = _even(image).shape[:2]
-    source = f"-f rawvideo -pixel_format rgb24 -video_size {width}x{height} -framerate {fps}"
+    source = f"-f rawvideo -pixel_format rgb24 -video_size {width}x{height} -framerate {exact_rate(fps)}"
     # Without an explicit matrix ffmpeg converts by BT.601 and players decode by BT.709.
     convert = "scale=out_color_matrix=bt709:out_range=tv,format=yuv420p"
     tag = "setparams=colorspace=bt709:color_primaries=bt709:color_trc=iec61966-2-1"

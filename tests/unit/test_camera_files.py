@@ -21,6 +21,9 @@ def camera(name: str, place: float, focal: float = 300.0) -> Camera:
     return Camera(K, look_at(np.array([place, 1.0, 3.0]), np.array([0.0, 1.0, 0.0])), 192, 256, name)
 
 
+MOVING = CameraPath(tuple(camera("moving", 0.3 * i) for i in range(3)), (1001, 1005, 1010))
+
+
 @pytest.fixture
 def rig() -> list[CameraPath]:
     """One at rest, one that moves, one that zooms as well."""
@@ -82,6 +85,38 @@ def test_frames_override_the_still_camera_in_any_order(tmp_path):
     assert torch.equal(found.at(1001).K, one.K)
     assert torch.equal(found.at(1010).T_camera_world, one.T_camera_world)
     assert torch.equal(found.at(1010).K, two.K)
+
+
+@pytest.mark.parametrize(
+    ("own", "wanted", "keys"),
+    [
+        (24, 30.0, (1001, 1006, 1012.25)),
+        (24.0, 60.0, (1001, 1011, 1023.5)),
+        (30, 24000 / 1001, (1001, 1001 + 3200 / 1001, 1001 + 7200 / 1001)),
+        (29.97, 30000 / 1001, (1001, 1005, 1010)),
+        (24.0, None, (1001, 1005, 1010)),
+        (None, 30.0, (1001, 1005, 1010)),
+    ],
+)
+def test_cameras_of_another_rate_are_where_they_are_by_seconds(tmp_path, own, wanted, keys):
+    path = write_cameras_json([MOVING], tmp_path / "cameras.json")
+    if own is not None:
+        path.write_text(json.dumps({"fps": own, **json.loads(path.read_text())}))
+    (found,) = read_cameras_json(path, fps=wanted)
+    assert found.frames == pytest.approx(keys, abs=1e-9)
+    for key, expected in zip(found.frames, MOVING.cameras, strict=True):
+        assert torch.equal(found.at(key).T_camera_world, expected.T_camera_world)
+    # A file that says its frames anew says the same.
+    (again,) = read_cameras_json(write_cameras_json([found], tmp_path / "again.json"))
+    assert again.frames == found.frames
+
+
+@pytest.mark.parametrize("rate", [0, -24, "24", True, float("nan"), float("inf")])
+def test_a_rate_that_is_none_is_refused(tmp_path, rate):
+    path = write_cameras_json([MOVING], tmp_path / "cameras.json")
+    path.write_text(json.dumps({"fps": rate, **json.loads(path.read_text())}))
+    with pytest.raises(ConfigError, match=r"cameras\.json: expected fps as a number > 0, found"):
+        read_cameras_json(path, fps=24.0)
 
 
 FLAT = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]

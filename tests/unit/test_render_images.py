@@ -1,4 +1,6 @@
+import struct
 import subprocess
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -53,6 +55,18 @@ def test_video_is_8_bit_420_tagged_bt709(tmp_path):
     report = subprocess.run(command, check=False, capture_output=True, text=True).stderr
     assert "yuv420p(tv, bt709/bt709/iec61966-2-1" in report
     assert "24 fps" in report
+
+
+@pytest.mark.parametrize(
+    ("fps", "meant"), [(23.976, (24000, 1001)), (30000 / 1001, (30000, 1001)), (25.0, (25, 1))]
+)
+def test_video_plays_at_the_fraction_that_its_rate_stands_for(tmp_path, fps, meant):
+    content = write_mp4([np.zeros((32, 32, 3), np.uint8)] * 2, tmp_path / "out.mp4", fps=fps).read_bytes()
+    # ISO 14496-12: after name, version and two dates the media header has its timescale, ...
+    (timescale,) = struct.unpack_from(">I", content, content.index(b"mdhd") + 16)
+    # ... and after name, version and count the table of times how many frames last how long.
+    frames, duration = struct.unpack_from(">II", content, content.index(b"stts") + 12)
+    assert (Fraction(timescale, duration), frames) == (Fraction(*meant), 2)
 
 
 @pytest.mark.parametrize(

@@ -1,16 +1,15 @@
 """What an EXR's header says of camera, time, colour and origin (OpenEXR's standard attributes)."""
 
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float32
 
+from dsar.geometry.rates import exact_rate
 from dsar.types import Camera, Picture
 from dsar_exporters.optional import require
 
-_NTSC = Fraction(1000, 1001)
 _SENSOR_MM = 36.0
 """Width of the film back that focal lengths refer to: a pinhole camera has none of its own."""
 
@@ -49,15 +48,6 @@ def make_header(picture: Picture, interop_id: str, window: Window, job: str) -> 
         "dsar/frame": str(picture.frame),
         "dsar/job": job,
     }
-
-
-def rational_fps(fps: float) -> Fraction:
-    """Return a frame rate as the fraction it stands for: 24/1, 25/2, and 24000/1001 for 23.976."""
-    whole = round(fps)
-    ntsc = whole * _NTSC
-    if fps != whole and abs(fps - ntsc) < 1e-3:
-        return ntsc
-    return Fraction(fps).limit_denominator(1000)
 
 
 def world_to_camera(camera: Camera) -> Float32[np.ndarray, "4 4"]:
@@ -117,7 +107,7 @@ def _lens(camera: Camera) -> dict[str, Any]:
 
 def _time(picture: Picture) -> dict[str, Any]:
     """Return the frame's rate, number, time code, time in seconds, and how long the shutter was open."""
-    rate = rational_fps(picture.fps)
+    rate = exact_rate(picture.fps)
     opens, closes = picture.shutter
     exposure = closes - opens
     shutter = {"shutterAngle": 360.0 * exposure, "expTime": exposure / picture.fps} if exposure else {}

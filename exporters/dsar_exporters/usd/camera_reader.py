@@ -19,6 +19,7 @@ from pxr import Gf, Usd, UsdGeom
 
 from dsar.errors import ExportError
 from dsar.geometry.paths import START_FRAME, CameraPath
+from dsar.geometry.rates import exact_rate, same_rate
 from dsar.geometry.rotations import nearest_rotation
 from dsar.types import Camera
 from dsar_exporters.usd.stages import open_stage
@@ -30,8 +31,6 @@ _OBJECT_NAME = "userProperties:blender:object_name"
 _FITS = 0.01
 """How far the aspects of aperture and picture may differ and mean the same: rounding to whole pixels."""
 _RIGID_TOLERANCE = 1e-4
-_SAME_RATE = 2e-4
-"""Relative: 23.976 is 24000/1001."""
 _Y_UP_FROM_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 _STATE = 5
 """Numbers of a lens, before the sixteen of its place."""
@@ -114,11 +113,11 @@ class _CameraReader:
     def _ratio(self, fps: float | None) -> float:
         """Return how many frames pass while a time code does; 1 where the stage says nothing of a rate."""
         rate = _rate(self._prim.GetStage())
-        if rate is None or fps is None or abs(rate / fps - 1) <= _SAME_RATE:
+        if rate is None or fps is None or same_rate(rate, fps):
             return 1.0
         if not 0 < rate < math.inf:
             raise ExportError(f"{self._where}: expected time codes per second > 0, found {rate:g}: set them")
-        return fps / rate
+        return float(exact_rate(fps) / exact_rate(rate))
 
     def _may_move(self) -> bool:
         return any(attribute.ValueMightBeTimeVarying() for attribute in self._lens) or any(

@@ -1,0 +1,84 @@
+"""Deliveries at other frame rates than the avatar's: where their frames lie in a rollout, and what is there.
+
+The network steps at the rate that it was trained at, whatever is delivered. Between two steps what it adds
+to the template at rest is blended in a line (of scales their logarithms, of opacities their logits), and
+posed by the motion at that very time: limbs go on arcs, not on chords between posed frames.
+"""
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from fractions import Fraction
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from dsar.avatar.track import find_jumps
+from dsar.body.skinning import forward_kinematics
+from dsar.errors import MotionError
+from dsar.geometry.rates import exact_rate
+from dsar.network import NetworkOutput
+from dsar.types import Body, Motion
+
+
+@dataclass(frozen=True)
+class Moment:
+    """Where a delivered frame lies in a rollout."""
+
+    step: int
+    """The rollout's frame at that time or, if there is none, right before it; counted from 0."""
+    share: float
+    """How much of the way to the next frame has passed, in [0, 1); 0: it is the rollout's own frame."""
+
+
+def place_frames(body: Body, motion: Motion, delivered: Motion) -> list[Moment]:
+    """Return where each frame of a delivery lies in the rollout of a motion; both begin together.
+
+    Times are exact: 24 and 24000/1001 frames a second meet 30 where they truly do. Across a jump of the body
+    (a cut) nothing is blended: the nearer frame is taken.
+
+    Raises:
+        MotionError: the delivery goes on a frame of the rollout or more after the last.
+    """
+    ratio, last = exact_rate(motion.fps) / exact_rate(delivered.fps), len(motion) - 1
+    if (len(delivered) - 1) * ratio >= last + 1:
+        raise MotionError(
+            f"motion {motion.name}: expected a delivery of its {len(motion) / motion.fps:g} s, found "
+            f"{len(delivered)} frames at {delivered.fps:g} a second: resample the same motion for both"
+        )
+    jumps = set(find_jumps(_transforms(body, motion), body.joints[0], motion.fps))
+    return [_place(frame * ratio, jumps) for frame in range(len(delivered))]
+
+
+def pose_frames(
+    body: Body, motion: Motion, delivered: Motion, moments: list[Moment]
+) -> Float[Tensor, "f j 4 4"]:
+    """Return T_world_rest of every joint at some moments of a rollout: its own where they are its frames."""
+    transforms = _transforms(body, delivered)
+    own = torch.tensor([moment.share == 0 for moment in moments], device=transforms.device)
+    steps = torch.tensor([moment.step for moment in moments], device=transforms.device)
+    transforms[own] = _transforms(body, motion)[steps[own]]
+    return transforms
+
+
+def keep_residuals(output: NetworkOutput) -> NetworkOutput:
+    """Return a copy of what poses Gaussians, which lasts while the network goes on."""
+    return NetworkOutput(output.offset.clone(), output.appearance.clone(), ())
+
+
+def blend_residuals(first: NetworkOutput, second: NetworkOutput, share: float) -> NetworkOutput:
+    """Return the residuals some share of the way from one step to the next."""
+    offset = torch.lerp(first.offset, second.offset, share)
+    return NetworkOutput(offset, torch.lerp(first.appearance, second.appearance, share), ())
+
+
+def _place(time: Fraction, jumps: Collection[int]) -> Moment:
+    """Return the moment of a time in frames of the rollout."""
+    step, share = int(time), time % 1
+    if step + 1 in jumps:
+        step, share = step + round(share), Fraction(0)
+    return Moment(step, float(share))
+
+
+def _transforms(body: Body, motion: Motion) -> Float[Tensor, "f j 4 4"]:
+    return forward_kinematics(body, motion.rotations.to(body.joints), motion.translations.to(body.joints))
