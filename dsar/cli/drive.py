@@ -1,18 +1,24 @@
 """What `dsar export` and `dsar render` share: a trained avatar and the motion that drives it."""
 
 import hashlib
-from collections.abc import Sequence
+import logging
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from dsar.cli.common import Common, capture_sequence
-from dsar.types import Camera, GaussianSequence, Motion
+from dsar.errors import ConfigError, DsarError
+from dsar.types import Body, Camera, GaussianSequence, Motion
 
 if TYPE_CHECKING:
     from dsar.avatar.avatar import Avatar
+    from dsar.training.scene import Scene
+
+LOGGER = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -21,9 +27,16 @@ class Performance:
 
     avatar: "Avatar"
     motion: Motion
-    cameras: tuple[Camera, ...]
-    """Those of the capture."""
+    scene: "Callable[[], Scene]"
+    """Opens what the run keeps of its capture, once it is needed."""
     provenance: dict[str, str]
+    inputs: dict[str, str]
+    """Hashes of what was read, by what it is: checkpoint, model settings, motion."""
+
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """Those of the capture; a DsarError where there is neither it nor what a run keeps of it."""
+        return self.scene().cameras
 
     def roll_out(self, frames: Sequence[int] | None = None) -> GaussianSequence:
         """Return the Gaussians of some frames, all by default."""
@@ -55,34 +68,67 @@ class Drive(Common):
 
         return self.run_folder or newest_run().folder
 
+    def motion_file(self) -> Path | None:
+        """Return the file that --motion names; None where it is to be a sequence or split of the capture."""
+        path = Path(self.motion)
+        named_like_one = path.suffix.lower() in (".npz", ".bvh")
+        return path if named_like_one or (path.suffix and path.is_file()) else None
+
     def open(self) -> Performance:
         """Return the avatar and its motion."""
-        from dsar.avatar.rollout import START_FRAME
-        from dsar.data.capture import capture_of
         from dsar.data.motion import read_motion, resample
-        from dsar.data.novelty import report_novelty
         from dsar.training.checkpoint import Run, load_checkpoint
+        from dsar.training.scene import open_scene
 
         self.check_device()
-        avatar, config, provenance = load_checkpoint(Run(self.chosen_run()))
-        capture = capture_of(config)
-        name = capture_sequence(capture, self.motion)
-        if name is not None:
-            motion = capture.motions[name]
+        run, file = Run(self.chosen_run()), self.motion_file()
+        avatar, config, provenance = load_checkpoint(run)
+        scene = cache(partial(open_scene, run, config))
+        if file is None:
+            motion = _sequence(scene(), self.motion)
+            read = _hash(motion)
         else:
-            motion = read_motion(Path(self.motion), avatar.body)
+            motion = read_motion(file, avatar.body)
+            read = _digest(file.read_bytes())
         if motion.fps != avatar.fps:
             motion = resample(motion, avatar.fps)
-        if name is None:
-            known = [capture.motions[trained] for trained in capture.splits["train"]]
-            report_novelty(avatar.body, motion, known, START_FRAME)
+        if file is not None:
+            _compare_with_training(avatar.body, motion, scene)
         provenance["motion_hash"] = _hash(motion)
-        return Performance(avatar, motion, tuple(capture.cameras), provenance)
+        settings = _digest(repr(config.model).encode())
+        inputs = {"checkpoint": provenance["checkpoint"], "model": settings, "motion": read}
+        return Performance(avatar, motion, scene, provenance, inputs)
+
+
+def _sequence(scene: "Scene", motion: str) -> Motion:
+    """Return the sequence of the capture that --motion names."""
+    name = capture_sequence(scene, motion)
+    if name is None:
+        raise ConfigError(
+            f"--motion {motion}: expected a .npz or .bvh file, `test`, `train`, or one of the capture's "
+            f"sequences {', '.join(scene.motions)}; found none of them"
+        )
+    return scene.motions[name]
+
+
+def _compare_with_training(body: Body, motion: Motion, scene: "Callable[[], Scene]") -> None:
+    """Log how far a motion is from those of training, where these are known."""
+    from dsar.avatar.rollout import START_FRAME
+    from dsar.data.novelty import report_novelty
+
+    try:
+        known = [scene().motions[trained] for trained in scene().splits["train"]]
+    except DsarError as error:
+        LOGGER.warning("Motion %s: not compared with training's, which are not known: %s", motion.name, error)
+        return
+    report_novelty(body, motion, known, START_FRAME)
 
 
 def _hash(motion: Motion) -> str:
     """Return a hash of the poses: a file may change and keep its name."""
-    digest = hashlib.sha256()
-    for values in (motion.rotations, motion.translations):
-        digest.update(values.cpu().contiguous().numpy().tobytes())
-    return digest.hexdigest()[:16]
+    values = (motion.rotations, motion.translations)
+    return _digest(b"".join(each.cpu().contiguous().numpy().tobytes() for each in values))
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:16]
