@@ -76,11 +76,15 @@ class Drive(Common):
 
     def open(self) -> Performance:
         """Return the avatar and its motion."""
+        import torch
+
         from dsar.data.motion import read_motion, resample
         from dsar.training.checkpoint import Run, load_checkpoint
         from dsar.training.scene import open_scene
 
         self.check_device()
+        # With more threads sums are added in another order, and bytes would depend on the number of cores.
+        torch.set_num_threads(1)
         run, file = Run(self.chosen_run()), self.motion_file()
         avatar, config, provenance = load_checkpoint(run)
         scene = cache(partial(open_scene, run, config))

@@ -84,14 +84,10 @@ class Render(Drive):
 
     def run(self) -> None:
         """Render every chosen camera and write every requested format."""
-        import torch
-
         from dsar_render import Shot
 
         if self.exr is None and self.png is None and self.mp4 is None:
             raise ConfigError("dsar render: nothing to write; give --exr DIR, --png DIR or --mp4 FILE")
-        # With more threads sums are added in another order, and bytes would depend on the number of cores.
-        torch.set_num_threads(1)
         wanted = self.wanted_frames()
         settings = self.settings()
         writers = tuple(self.writers())

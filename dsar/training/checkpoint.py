@@ -222,9 +222,7 @@ def _without_checkpoint(run: Run) -> str:
         return f"{run.folder}: {'a file, no run folder' if run.folder.exists() else 'no such folder'}"
     left = run.folder / "checkpoint.old"
     if left.is_dir():
-        return (
-            f"{run.folder} holds no checkpoint, but {left} from a crash: rename it to {run.checkpoint.name}"
-        )
+        return f"{run.folder} holds no checkpoint, but {left.name} of a crash: rename it to checkpoint"
     return f"{run.folder} holds no checkpoint"
 
 

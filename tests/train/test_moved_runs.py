@@ -13,6 +13,7 @@ from dsar.body.files import load_body
 from dsar.cli import main
 from dsar.data.capture import open_capture
 from dsar.data.motion import write_motion
+from dsar.evaluation.stress import run_causal
 from dsar.geometry.camera_files import write_cameras_json
 from dsar.geometry.paths import CameraPath
 from dsar.training.scene import read_scene, scene_of_capture
@@ -91,6 +92,7 @@ def test_a_run_that_moved_and_whose_capture_is_deleted_delivers_the_same_bytes(
     assert deliver("../archive/renamed", tmp_path / "after") == before
     monkeypatch.chdir(run)
     assert deliver(".", tmp_path / "inside") == before
+    monkeypatch.setattr("dsar.evaluation.stress.CASES", {"causal": run_causal})
     command("stress", run)
     said = failure(capsys, "eval", run)
     assert f"its capture {home / 'caps' / 'tiny'} is not there" in said
