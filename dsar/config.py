@@ -8,9 +8,13 @@ import dataclasses
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar, cast, get_args, get_origin, get_type_hints
 
 from dsar.errors import ConfigError
+
+EMBEDDED = "embedded"
+"""Stands for the capture that comes with the package, in place of a folder."""
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -191,10 +195,10 @@ class ScheduleConfig:
 class TrainConfig:
     """A whole run."""
 
-    capture: str = "embedded"
-    """A capture folder, or `embedded`."""
+    capture: str = EMBEDDED
+    """A capture folder, absolute once a run began, or `embedded`."""
     body: str | None = None
-    """An SMPL-X model file; none: the capture's own, else the embedded body."""
+    """An SMPL-X model file, likewise; none: the capture's own, else the embedded body."""
     preset: str = "demo"
     """The preset that the other values started from."""
     train_frames: str | None = None
@@ -215,7 +219,11 @@ class TrainConfig:
     def validate(self) -> None:
         """Raise ConfigError where settings contradict each other."""
         atlas, model, schedule = self.atlas, self.model, self.schedule
-        counts = {f"model.{name}": getattr(model, name) for name in ("upsample", "pixel_shuffle")}
+        if self.preset not in PRESETS:
+            raise ConfigError(f"preset is {self.preset!r}; there are {', '.join(PRESETS)}")
+        if not model.channels:
+            raise ConfigError("model.channels is empty; the encoder has at least one level")
+        counts = {f"model.{name}": getattr(model, name) for name in ("upsample", "pixel_shuffle", "heads")}
         counts |= {f"schedule.{name}": getattr(schedule, name) for name in ("streams", "segment", "views")}
         for name, count in counts.items():
             if count < 1:
@@ -313,21 +321,69 @@ def config_to_json(config: TrainConfig) -> str:
 
 
 def config_from_json(path: Path) -> TrainConfig:
-    """Read a config.json; raise ConfigError where a key is unknown or missing."""
+    """Read a config.json.
+
+    Raises:
+        ConfigError: it cannot be read, a setting is unknown, missing or of another kind, or settings
+            contradict each other.
+    """
     try:
-        values = json.loads(path.read_text())
-        sections = {
-            "atlas": AtlasConfig,
-            "model": ModelConfig,
-            "loss": LossConfig,
-            "schedule": ScheduleConfig,
-        }
-        for name, section in sections.items():
-            values[name] = section(**_tuples(values[name]))
-        return TrainConfig(**values)
-    except (OSError, json.JSONDecodeError, KeyError, TypeError) as error:
-        raise ConfigError(f"{path} is not a config.json that this version reads: {error}") from error
+        values = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise ConfigError(f"{path}: expected the settings of a run, found no such file") from error
+    except ValueError as error:
+        raise ConfigError(
+            f"{path}: expected the settings of a run as JSON, found a damaged file or another ({error})"
+        ) from error
+    try:
+        config = _from_values(TrainConfig, values, "")
+        config.validate()
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}; it was changed, or is of another version") from error
+    return config
 
 
-def _tuples(section: dict[str, Any]) -> dict[str, Any]:
-    return {key: tuple(value) if isinstance(value, list) else value for key, value in section.items()}
+def _from_values(kind: type[T], values: Any, prefix: str) -> T:
+    """Return a dataclass of settings from JSON, in which each of them stands, and nothing else."""
+    if not isinstance(values, dict):
+        raise ConfigError(f"expected {prefix.rstrip('.') or 'the settings'} as an object, found {values!r}")
+    hints = get_type_hints(kind)
+    for what, names in (("unknown", values.keys() - hints), ("missing", hints.keys() - values)):
+        if names:
+            raise ConfigError(f"{what}: {', '.join(prefix + name for name in sorted(names))}")
+    return kind(**{name: _from_value(hint, values[name], prefix + name) for name, hint in hints.items()})
+
+
+def _from_value(hint: Any, value: Any, name: str) -> Any:
+    """Return a setting's value of the type that it has."""
+    if dataclasses.is_dataclass(hint):
+        return _from_values(cast(type, hint), value, f"{name}.")
+    parts = get_args(hint)
+    if get_origin(hint) is Literal:
+        fits = value in parts
+    elif get_origin(hint) is tuple:
+        fits = isinstance(value, list) and all(_is_of(each, parts[0]) for each in value)
+    else:
+        fits = any(_is_of(value, kind) for kind in parts or (hint,))
+    if not fits:
+        expected = " or ".join(map(repr, parts)) if get_origin(hint) is Literal else hint
+        raise ConfigError(f"{name} is {value!r}, expected {getattr(expected, '__name__', expected)}")
+    return tuple(value) if isinstance(value, list) else value
+
+
+def _is_of(value: Any, kind: type) -> bool:
+    """Return whether a JSON value is of a type; every integer is a number, too, and a truth value neither."""
+    if kind is float:
+        return isinstance(value, int | float) and not isinstance(value, bool)
+    return type(value) is kind
+
+
+def with_absolute_paths(config: TrainConfig) -> TrainConfig:
+    """Return settings that mean the same capture and body file in whatever folder they are read."""
+    body = None if config.body is None else str(Path(config.body).resolve())
+    return dataclasses.replace(config, capture=absolute_capture(config.capture), body=body)
+
+
+def absolute_capture(capture: str) -> str:
+    """Return the path of a capture as it is from any folder; `embedded` stays what it is."""
+    return capture if capture == EMBEDDED else str(Path(capture).resolve())

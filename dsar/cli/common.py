@@ -5,13 +5,17 @@ import json
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from dsar.console import ProgressStyle, follow
 from dsar.errors import ConfigError
 from dsar.types import GaussianSequence
+
+if TYPE_CHECKING:
+    from dsar.data.multiview import MultiViewCapture
+    from dsar.training.scene import Scene
 
 Device = Literal["auto", "cpu", "cuda"]
 
@@ -90,14 +94,21 @@ def shown(sequence: GaussianSequence, style: ProgressStyle, title: str) -> Gauss
     )
 
 
-def capture_sequence(capture, motion: str) -> str | None:
+def capture_sequence(capture: "MultiViewCapture | Scene", motion: str) -> str | None:
     """Return the sequence that --motion names, None where it names a file.
 
     A split stands for its sequence furthest from training (labelled fd), else for its first.
+
+    Raises:
+        ConfigError: a split has no sequence.
     """
     if motion in capture.motions:
         return motion
     if motion in ("test", "train"):
-        names = list(capture.splits[motion])
+        names = list(capture.splits.get(motion, ()))
+        if not names:
+            raise ConfigError(
+                f"capture {capture.name} has no {motion} sequence; name one of {', '.join(capture.motions)}"
+            )
         return next((name for name in names if name in capture.splits.get("fd", ())), names[0])
     return None

@@ -13,7 +13,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from dsar.data.capture import MultiViewCapture
-    from dsar.types import Gaussians
+    from dsar.training.scene import Scene
+    from dsar.types import Body, Gaussians
     from dsar_render.crosscheck import Shape
 
 _PAGES = Path("runs/check")
@@ -59,8 +60,8 @@ class Crosscheck(OnRun):
             raise ConfigError("dsar crosscheck: expected a run or --capture, found both: give one of them")
         if self.body is not None and self.capture is None:
             raise ConfigError("--body: expected with --capture; a run has its own")
-        capture, drive, page = self.open()
-        shapes = [self.posed(capture)]
+        capture, body, drive, page = self.open()
+        shapes = [self.posed(capture, body)]
         cameras = list(capture.cameras)
         written = written_projections(cameras)
         mi = load_mitsuba(self.variant)
@@ -86,28 +87,29 @@ class Crosscheck(OnRun):
         if not verdict.passed:
             raise SystemExit(1)
 
-    def open(self) -> "tuple[MultiViewCapture, Callable[[], Gaussians] | None, Path]":
-        """Return the capture, what makes a run's Gaussians of the frame, and where the page goes."""
+    def open(self) -> "tuple[MultiViewCapture | Scene, Body, Callable[[], Gaussians] | None, Path]":
+        """Return cameras and motions, the body, what makes a run's Gaussians of the frame, and the page."""
         from dsar.avatar import roll_out
         from dsar.avatar.rollout import START_FRAME
-        from dsar.data.capture import capture_of, open_capture
+        from dsar.data.capture import open_capture
         from dsar.training.checkpoint import Run, load_checkpoint
+        from dsar.training.scene import open_scene
 
         if self.capture is not None:
             capture = open_capture(self.capture, body=self.body)
-            return capture, None, _PAGES / f"{capture.name}.crosscheck.html"
+            return capture, capture.body, None, _PAGES / f"{capture.name}.crosscheck.html"
         run = Run(self.chosen_run())
         avatar, config, _ = load_checkpoint(run)
-        capture = capture_of(config)
-        motion = capture.motions[self.sequence(capture)]
+        scene = open_scene(run, config)
+        motion = scene.motions[self.sequence(scene)]
 
         def drive() -> "Gaussians":
             _, gaussians = next(iter(roll_out(avatar, motion, frames=[START_FRAME + self.frame])))
             return gaussians.detach()
 
-        return capture, drive, run.folder / "crosscheck.html"
+        return scene, avatar.body, drive, run.folder / "crosscheck.html"
 
-    def sequence(self, capture: "MultiViewCapture") -> str:
+    def sequence(self, capture: "MultiViewCapture | Scene") -> str:
         """Return the sequence whose pose is shown; check that it has the frame."""
         name = next(iter(capture.motions))
         if capture.splits.get("test"):
@@ -119,10 +121,10 @@ class Crosscheck(OnRun):
             )
         return name
 
-    def posed(self, capture: "MultiViewCapture") -> "Shape":
+    def posed(self, capture: "MultiViewCapture | Scene", body: "Body") -> "Shape":
         """Return the body in the frame's pose."""
         from dsar.body.skinning import pose_vertices
         from dsar_render.crosscheck import Shape
 
         motion = capture.motions[self.sequence(capture)]
-        return Shape("body", pose_vertices(capture.body, motion[self.frame]), capture.body.faces)
+        return Shape("body", pose_vertices(body, motion[self.frame]), body.faces)

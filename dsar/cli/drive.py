@@ -1,18 +1,23 @@
 """What `dsar export` and `dsar render` share: a trained avatar and the motion that drives it."""
 
 import hashlib
-from collections.abc import Sequence
+import logging
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from dsar.cli.common import OnRun, capture_sequence
-from dsar.errors import ConfigError
+from dsar.errors import ConfigError, DsarError
 from dsar.geometry.rates import exact_rate, parse_rate, same_rate
-from dsar.types import Camera, GaussianSequence, Motion
+from dsar.types import Body, Camera, GaussianSequence, Motion
 
 if TYPE_CHECKING:
     from dsar.avatar.avatar import Avatar
+    from dsar.training.scene import Scene
+
+LOGGER = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -23,9 +28,16 @@ class Performance:
     motion: Motion
     delivered: Motion
     """The same at the rate of the frames that are written."""
-    cameras: tuple[Camera, ...]
-    """Those of the capture."""
+    scene: "Callable[[], Scene]"
+    """Opens what the run keeps of its capture, once it is needed."""
     provenance: dict[str, str]
+    inputs: dict[str, str]
+    """Hashes of what was read, by what it is: checkpoint, model settings, motion."""
+
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """Those of the capture; a DsarError where there is neither it nor what a run keeps of it."""
+        return self.scene().cameras
 
     def roll_out(self, frames: Sequence[int] | None = None) -> GaussianSequence:
         """Return the Gaussians of some frames, all by default."""
@@ -56,36 +68,43 @@ class Drive(OnRun):
 
         return None if self.frames is None else parse_frames(self.frames)
 
+    def motion_file(self) -> Path | None:
+        """Return the file that --motion names; None where it is to be a sequence or split of the capture."""
+        path = Path(self.motion)
+        named_like_one = path.suffix.lower() in (".npz", ".bvh")
+        return path if named_like_one or (path.suffix and path.is_file()) else None
+
     def open(self) -> Performance:
         """Return the avatar and its motion."""
-        from dsar.avatar.rollout import START_FRAME
-        from dsar.data.capture import capture_of
         from dsar.data.motion import read_motion, resample
-        from dsar.data.novelty import report_novelty
         from dsar.data.plausibility import judge_motion
         from dsar.training.checkpoint import Run, load_checkpoint
+        from dsar.training.scene import open_scene
 
         self.check_device()
         fps = None if self.fps is None else parse_rate(self.fps)
-        avatar, config, provenance = load_checkpoint(Run(self.chosen_run()))
-        capture = capture_of(config)
-        name = capture_sequence(capture, self.motion)
-        if name is not None:
-            self._refuse_file_flags(name)
-            motion = capture.motions[name]
+        run, file = Run(self.chosen_run()), self.motion_file()
+        avatar, config, provenance = load_checkpoint(run)
+        scene = cache(partial(open_scene, run, config))
+        if file is None:
+            self._refuse_file_flags(self.motion)
+            motion = _sequence(scene(), self.motion)
+            read = _hash(motion)
         else:
             rate = None if self.motion_fps is None else parse_rate(self.motion_fps, "--motion-fps")
-            motion = read_motion(Path(self.motion), avatar.body, up=self.up, fps=rate)
+            motion = read_motion(file, avatar.body, up=self.up, fps=rate)
             judge_motion(avatar.body, motion)
+            read = _digest(file.read_bytes())
         provenance["motion_hash"] = _hash(motion)
-        driven = delivered = motion if same_rate(motion.fps, avatar.fps) else resample(motion, avatar.fps)
+        driven = delivered = resample(motion, avatar.fps)
         if fps is not None and not same_rate(fps, avatar.fps):
             delivered = resample(motion, fps)
             provenance["fps"] = str(exact_rate(fps))
-        if name is None:
-            known = [capture.motions[trained] for trained in capture.splits["train"]]
-            report_novelty(avatar.body, delivered, known, START_FRAME)
-        return Performance(avatar, driven, delivered, tuple(capture.cameras), provenance)
+        if file is not None:
+            _compare_with_training(avatar.body, delivered, scene)
+        settings = _digest(repr(config.model).encode())
+        inputs = {"checkpoint": provenance["checkpoint"], "model": settings, "motion": read}
+        return Performance(avatar, driven, delivered, scene, provenance, inputs)
 
     def _refuse_file_flags(self, sequence: str) -> None:
         """Raise ConfigError where flags for motion files stand beside a sequence of the capture."""
@@ -96,9 +115,35 @@ class Drive(OnRun):
             )
 
 
+def _sequence(scene: "Scene", motion: str) -> Motion:
+    """Return the sequence of the capture that --motion names."""
+    name = capture_sequence(scene, motion)
+    if name is None:
+        raise ConfigError(
+            f"--motion {motion}: expected a .npz or .bvh file, `test`, `train`, or one of the capture's "
+            f"sequences {', '.join(scene.motions)}; found none of them"
+        )
+    return scene.motions[name]
+
+
+def _compare_with_training(body: Body, motion: Motion, scene: "Callable[[], Scene]") -> None:
+    """Log how far a motion is from those of training, where these are known."""
+    from dsar.avatar.rollout import START_FRAME
+    from dsar.data.novelty import report_novelty
+
+    try:
+        known = [scene().motions[trained] for trained in scene().splits["train"]]
+    except DsarError as error:
+        LOGGER.warning("Motion %s: not compared with training's, which are not known: %s", motion.name, error)
+        return
+    report_novelty(body, motion, known, START_FRAME)
+
+
 def _hash(motion: Motion) -> str:
     """Return a hash of the poses and their rate: a file may change and keep its name."""
-    digest = hashlib.sha256(repr(motion.fps).encode())
-    for values in (motion.rotations, motion.translations):
-        digest.update(values.cpu().contiguous().numpy().tobytes())
-    return digest.hexdigest()[:16]
+    values = [each.cpu().contiguous().numpy().tobytes() for each in (motion.rotations, motion.translations)]
+    return _digest(b"".join([repr(motion.fps).encode(), *values]))
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:16]

@@ -1,5 +1,6 @@
 """`dsar export`."""
 
+import logging
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,12 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dsar.cli.common import shown
-from dsar.cli.drive import Drive
-from dsar.errors import ConfigError
+from dsar.cli.drive import Drive, Performance
+from dsar.errors import CheckpointError, ConfigError
 from dsar.types import Camera
 
 if TYPE_CHECKING:
     from dsar_exporters import Output
+
+LOGGER = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -67,7 +70,7 @@ class Export(Drive):
         wanted = self.wanted_frames()
         performance = self.open()
         sequence = performance.roll_out(wanted)
-        outputs = self.outputs(performance.cameras)
+        outputs = self.outputs(self.cameras(performance))
         delivered = export(shown(sequence, self.progress, "export"), list(outputs.values()))
         facts = {"gaussians": sequence.num_gaussians, "frames": len(sequence), "fps": sequence.fps}
         written = {name: str(output.path) for name, output in outputs.items()}
@@ -76,6 +79,16 @@ class Export(Drive):
             for name, each in zip(outputs, delivered, strict=True)
         }
         self.write_json({"motion": performance.motion.name, "written": written, "cost": files, **facts})
+
+    def cameras(self, performance: Performance) -> Sequence[Camera]:
+        """Return the capture's cameras for formats that have cameras; none, and say so, if they are gone."""
+        if self.usd is None:
+            return ()
+        try:
+            return performance.cameras
+        except CheckpointError as error:
+            LOGGER.warning("--usd %s: of all cameras it has the turntable alone: %s", self.usd, error)
+            return ()
 
     def outputs(self, cameras: Sequence[Camera]) -> "dict[str, Output]":
         """Return the requested formats by the name of their flag."""

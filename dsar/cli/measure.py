@@ -55,6 +55,7 @@ class Eval(OnRun):
 
     def run_study(self) -> None:
         """Train and measure what the tables lack; print them."""
+        from dsar.config import absolute_capture
         from dsar.drafts import write_whole
         from dsar.evaluation.study import ABLATIONS, BASELINES, Study, summarize_tables, to_markdown
         from dsar.evaluation.study.chart import draw_chart, points_of, times_of
@@ -62,11 +63,12 @@ class Eval(OnRun):
         self.check_device()
         every = ABLATIONS | BASELINES
         tables = (ABLATIONS if self.ablations else {}) | (BASELINES if self.baselines else {})
-        study = Study(self.study, self.minutes, self.capture)
+        capture = absolute_capture(self.capture)
+        study = Study(self.study, self.minutes, capture)
         with Bar(self.progress, "study").running() as bar:
             complete = study.run(list(tables.values()), self.hours, lambda what, share: bar.show(share, what))
         summary = summarize_tables(study, tables)
-        facts = {"complete": complete, "minutes": self.minutes, "capture": self.capture}
+        facts = {"complete": complete, "minutes": self.minutes, "capture": capture}
         self.write_json(facts | {"tables": summary})
         found = facts | {"tables": summarize_tables(study, every)}
         write_whole(self.study / "study.json", json.dumps(found, indent=1) + "\n")
@@ -79,16 +81,16 @@ class Eval(OnRun):
 
     def run_heldout(self) -> None:
         """Measure one run."""
-        from dsar.data.capture import capture_of
         from dsar.drafts import write_whole
         from dsar.evaluation.heldout import evaluate
         from dsar.evaluation.report import write_report
         from dsar.training.checkpoint import Run, load_checkpoint
+        from dsar.training.scene import open_images
 
         self.check_device()
         run = Run(self.chosen_run())
         avatar, config, _ = load_checkpoint(run)
-        figures = evaluate(avatar, capture_of(config))
+        figures = evaluate(avatar, open_images(run, config))
         self.write_json(figures)
         write_worst(run.folder, figures["worst"])
         write_whole(run.figures, json.dumps(figures, indent=2) + "\n")
@@ -112,17 +114,17 @@ class Stress(OnRun):
 
     def run(self) -> None:
         """Run the battery on the held-out motion that is furthest from training; print each verdict."""
-        from dsar.data.capture import capture_of
         from dsar.drafts import write_whole
         from dsar.evaluation.report import write_report
         from dsar.evaluation.stress import CASES, stress
         from dsar.training.checkpoint import Run, load_checkpoint
+        from dsar.training.scene import open_scene
 
         self.check_device()
         run = Run(self.chosen_run())
         avatar, config, _ = load_checkpoint(run)
-        capture = capture_of(config)
-        verdicts = stress(avatar, capture.motions[capture_sequence(capture, "test") or ""], CASES)
+        scene = open_scene(run, config)
+        verdicts = stress(avatar, scene.motions[capture_sequence(scene, "test") or ""], CASES)
         found = {}
         for name, verdict in follow(verdicts, len(CASES), self.progress, "stress"):
             found[name] = verdict.to_json()

@@ -91,11 +91,12 @@ class _Scene:
 
     def __init__(self, folder: Path) -> None:
         from dsar.avatar.rollout import START_FRAME
-        from dsar.data.capture import capture_of
         from dsar.training.checkpoint import Run, load_checkpoint
+        from dsar.training.scene import open_images
 
-        self.avatar, config, _ = load_checkpoint(Run(folder))
-        self.capture, self.first = capture_of(config), START_FRAME
+        run = Run(folder)
+        self.avatar, config, _ = load_checkpoint(run)
+        self.capture, self.first = open_images(run, config), START_FRAME
         self.far = capture_sequence(self.capture, "test") or ""
 
     def some_cameras(self) -> list[int]:

@@ -1,22 +1,28 @@
 """`dsar render`."""
 
 import dataclasses
+import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
+from hashlib import sha256
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from dsar.cli.drive import Drive, Performance
+from dsar.cli.expect import check_inputs, to_flag
 from dsar.console import follow
-from dsar.errors import ConfigError
-from dsar.geometry.camera_files import list_cameras_json, read_cameras_json
+from dsar.errors import CheckpointError, ConfigError
+from dsar.geometry.camera_files import cameras_to_json, list_cameras_json, read_cameras_json
 from dsar.geometry.paths import DOLLY, ORBIT, TURNTABLE, CameraPath, dolly, orbit, turntable
 
 if TYPE_CHECKING:
+    from dsar_exporters import ColorTarget
     from dsar_render import RenderSettings, Shot
     from dsar_render.shot import PictureWriter
 
+LOGGER = logging.getLogger(__name__)
 _MADE = {TURNTABLE: turntable, ORBIT: orbit, DOLLY: dolly}
 
 
@@ -49,8 +55,8 @@ class Render(Drive):
     """Samples of a deep pixel at most."""
     colorspace: str = "lin_rec709_scene"
     """EXR: colour space (a name, alias or role of the OCIO configuration, such as ACEScg)."""
-    ocio: Path | None = None
-    """OCIO configuration; default: $OCIO, else the built-in one."""
+    ocio: str | None = None
+    """OCIO configuration: a file, or a built-in `ocio://NAME`; default: $OCIO, else the built-in one."""
     exr_compression: Literal["none", "rle", "zips", "zip", "piz", "pxr24", "b44", "b44a", "dwaa", "dwab"] = (
         "zips"
     )
@@ -71,6 +77,8 @@ class Render(Drive):
     """Render nothing; write an OpenJobDescription template that renders this in chunks on a farm."""
     chunk: int = 10
     """OpenJD: frames of a task."""
+    expect: str | None = None
+    """Written by --openjd: refuse where what the pictures depend on (NAME=HASH, with commas) differs here."""
     name: str = "avatar"
     """Name in the files."""
 
@@ -106,9 +114,11 @@ class Render(Drive):
         frames = wanted or list(whole.frame_numbers)
         performance.roll_out(frames)  # names frames that are not in the motion
         paths = self.paths(performance, frames)
+        if self.expect is not None:
+            check_inputs(self.expect, self.inputs(performance))
         shot = Shot(tuple(paths), writers, settings, previews=self.mp4 is not None)
         if self.openjd is not None:
-            self.write_template(self.openjd, frames)
+            self.write_template(self.openjd, performance, frames)
             return
         rendered = self.render(performance, shot, frames)
         self.write_json(
@@ -160,16 +170,24 @@ class Render(Drive):
 
     def writers(self) -> "Iterator[PictureWriter]":
         """Yield what pictures become."""
-        from dsar_exporters import ColorTarget, ExrSequence, ocio_config
+        from dsar_exporters import ExrSequence
         from dsar_render import PngSequence
 
         if self.exr is not None:
-            target = ColorTarget(self.colorspace, ocio_config(self.ocio))
+            target = self.color_target()
             layers = tuple(self.aov.split(","))
             how = {"compression": self.exr_compression, "views": self.exr_views, "crop": self.crop}
             yield ExrSequence(self.exr.absolute(), self.name, layers, target, **how)
         if self.png is not None:
             yield PngSequence(self.png.absolute(), self.name)
+
+    def color_target(self) -> "ColorTarget":
+        """Return the colour space and its configuration, as any folder names it."""
+        from dsar_exporters import ColorTarget, ocio_config
+
+        config = ocio_config(self.ocio)
+        absolute = config if config.startswith("ocio://") else str(Path(config).absolute())
+        return ColorTarget(self.colorspace, absolute)
 
     def paths(self, performance: Performance, frames: Sequence[int]) -> list[CameraPath]:
         """Return the cameras to render, at the requested resolution."""
@@ -198,7 +216,13 @@ class Render(Drive):
     def camera_names(self, performance: Performance) -> list[str]:
         """Return the names of the cameras to choose from: the capture's, or a file's."""
         if self.cameras is None:
-            return [camera.name for camera in performance.cameras]
+            try:
+                return [camera.name for camera in performance.cameras]
+            except CheckpointError:
+                # Those made for the motion need none of the capture's but for their size.
+                if self.res is None or not set(self.camera.split(",")) <= _MADE.keys():
+                    raise
+                return []
         if _is_usd(self.cameras):
             from dsar_exporters import list_usd_cameras
 
@@ -234,20 +258,43 @@ class Render(Drive):
                 "--mp4: expected cameras of one height, found several: give one size with --res W H"
             )
 
-    def write_template(self, path: Path, frames: Sequence[int]) -> None:
+    def inputs(self, performance: Performance) -> dict[str, str]:
+        """Return hashes of all that pictures depend on besides the command itself, by what they are of."""
+        found = {"dsar": version("dsar-avatar"), **performance.inputs}
+        rig = self.rig(performance, performance.roll_out().frame_numbers)
+        if rig:
+            found["cameras"] = sha256(cameras_to_json(rig).encode()).hexdigest()[:16]
+        if self.exr is not None:
+            found["ocio"] = sha256(self.color_target().contents.encode()).hexdigest()[:16]
+        return found
+
+    def write_template(self, path: Path, performance: Performance, frames: Sequence[int]) -> None:
         """Write the farm's job."""
         from dsar.drafts import write_whole
+        from dsar.training.checkpoint import Run
         from dsar_render import openjd_template
 
-        command = ["dsar", "render", *self.arguments()]
+        if self.mp4 is not None:
+            raise ConfigError("--mp4: a farm's task has some frames, a video all of them; leave --mp4 out")
+        run = Run(self.chosen_run())
+        if not run.scene.exists() and not (self.motion_file() and self.cameras):
+            LOGGER.warning(
+                "Run %s is older and keeps no cameras and motions: the farm's machines need its capture",
+                run.folder,
+            )
+        command = ["dsar", "render", *self.arguments(), "--expect", to_flag(self.inputs(performance))]
         write_whole(path, openjd_template(self.name, command, frames, chunk=self.chunk))
 
     def arguments(self) -> list[str]:
         """Return the arguments that make this command, but for which frames, with absolute paths."""
-        motion = Path(self.motion)
+        file = self.motion_file()
         found = [str(self.chosen_run().absolute())]
-        found += ["--motion", str(motion.absolute() if motion.is_file() else motion)]
-        left_out = ("run_folder", "motion", "frames", "openjd", "chunk", "json", "progress", "skip_existing")
+        found += ["--motion", self.motion if file is None else str(file.absolute())]
+        if self.exr is not None:
+            # Also the built-in one: another machine's $OCIO may name another.
+            found += ["--ocio", self.color_target().config]
+        left_out = ("run_folder", "motion", "frames", "ocio", "openjd", "chunk", "expect", "json", "progress")
+        left_out += ("skip_existing",)
         for each in dataclasses.fields(self):
             value = getattr(self, each.name)
             if each.name in left_out or value == each.default:

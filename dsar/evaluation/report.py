@@ -3,6 +3,7 @@
 import base64
 import dataclasses
 import json
+import logging
 import mimetypes
 import os
 import platform
@@ -15,11 +16,13 @@ import plotly.graph_objects as go
 from jinja2 import Environment, StrictUndefined
 from plotly.offline import get_plotlyjs
 
-from dsar.config import PRESETS, TrainConfig, config_from_json, config_to_json
+from dsar.config import PRESETS, TrainConfig, absolute_capture, config_to_json
 from dsar.drafts import write_whole
 from dsar.evaluation.study.chart import QUALITIES, interactive_chart, points_of, times_of
 from dsar.evaluation.study.summary import table_cells
-from dsar.training.checkpoint import Run, read_progress
+from dsar.training.checkpoint import Run, read_config, read_json, read_progress
+
+LOGGER = logging.getLogger(__name__)
 
 _STAGES = {"template": "#9aa5b1", "imitation": "#c77d0a", "pose": "#4c78a8", "autoregressive": "#2a7f62"}
 _METRICS = (
@@ -39,10 +42,10 @@ def write_report(run: Run) -> Path:
     That is config.json, metrics.jsonl, the checkpoint, previews, and the figures that `dsar eval` and
     `dsar stress` leave (figures.json, stress.json), and the tables of a study beside it.
     """
-    config, lines = config_from_json(run.config), _lines(run)
+    config, lines = read_config(run), _lines(run)
     figures, battery, study = map(_read, (run.figures, run.stress, run.study))
     # Models of another capture are no measure of this one.
-    study = study if study and study["capture"] == config.capture else None
+    study = study if study and absolute_capture(study["capture"]) == config.capture else None
     splits = {name: values for name, values in (figures or {}).get("splits", {}).items() if values}
     metrics = [key for key in _METRICS if any(values.get(key) is not None for values in splits.values())]
     facts = {
@@ -160,11 +163,24 @@ def _environment() -> list[tuple[str, str]]:
 def _lines(run: Run) -> list[dict[str, Any]]:
     if not run.metrics.exists():
         return []
-    return [json.loads(line) for line in run.metrics.read_text().splitlines()]
+    lines, cut = [], 0
+    for text in run.metrics.read_text(encoding="utf-8", errors="replace").splitlines():
+        try:
+            line = json.loads(text)
+        except ValueError:
+            line = None
+        # A run that was killed or had no room left has written a part of one.
+        if not isinstance(line, dict):
+            cut += 1
+            continue
+        lines.append(line)
+    if cut:
+        LOGGER.warning("%s: lines that are not whole, left out: %d of %d", run.metrics, cut, cut + len(lines))
+    return lines
 
 
 def _read(path: Path) -> dict[str, Any] | None:
-    return json.loads(path.read_text()) if path.exists() else None
+    return read_json(path) if path.exists() else None
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -112,11 +112,15 @@ def write_cameras_json(paths: Sequence[CameraPath], path: Path) -> Path:
     for name in names:
         _checked_name(name, str(path))
     _refuse_doubled(names, str(path))
-    # A line a camera or frame: for people and for `diff`.
-    text = ",\n".join(_written(camera) for camera in paths)
     with replacing(path) as draft:
-        draft.write_text(f'{{"cameras": [\n{text}\n]}}\n')
+        draft.write_text(cameras_to_json(paths))
     return path
+
+
+def cameras_to_json(paths: Sequence[CameraPath]) -> str:
+    """Return the text of a file of cameras, equal where they are equal: a line a camera or frame."""
+    text = ",\n".join(_written(camera) for camera in paths)
+    return f'{{"cameras": [\n{text}\n]}}\n'
 
 
 def _written(path: CameraPath) -> str:

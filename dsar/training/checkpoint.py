@@ -1,12 +1,13 @@
 """Run folders: what is written where, and how it is read back. No pickle is ever loaded.
 
 config.json              every setting of the run
+scene.safetensors        the capture's cameras and motions, without its images (`dsar.training.scene`)
 checkpoint/              replaced as a whole, never half written
     avatar.safetensors       parameters, skeleton, atlas
     adam.safetensors, muon.safetensors   moments of the optimisers
     rollouts-<rank>.safetensors, rollouts-<rank>.json   carried state of each worker's rollouts
     registration-<rank>.safetensors   offsets of the still and the registered frames
-    progress.json            step, progress, format version
+    progress.json            step, progress, format version, the run's folder at that time
 metrics.jsonl            one line per report
 figures.json, stress.json   what `dsar eval` and `dsar stress` found
 previews/, report.html   for people
@@ -15,25 +16,32 @@ previews/, report.html   for people
 import dataclasses
 import hashlib
 import json
+import logging
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors import SafetensorError
+from safetensors.torch import load as load_tensors
+from safetensors.torch import save_file
 from torch import Tensor
 
 from dsar.avatar.avatar import Avatar
 from dsar.body.atlas import Atlas
 from dsar.body.model import PARENTS
-from dsar.config import TrainConfig, config_from_json
+from dsar.config import EMBEDDED, TrainConfig, config_from_json
 from dsar.errors import CheckpointError, ConfigError
 from dsar.types import Body
 
 FORMAT_VERSION = 3
 _BODY = ("vertices", "faces", "joints", "weights", "uv", "uv_faces")
+# What a damaged or foreign file can raise on its way to what it should have been.
+_DAMAGE = (SafetensorError, ValueError, KeyError, IndexError, TypeError, AttributeError, RuntimeError)
+LOGGER = logging.getLogger(__name__)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,6 +55,11 @@ class Run:
     def config(self) -> Path:
         """All settings."""
         return self.folder / "config.json"
+
+    @property
+    def scene(self) -> Path:
+        """What drives the avatar by default: the capture's cameras and motions."""
+        return self.folder / "scene.safetensors"
 
     @property
     def metrics(self) -> Path:
@@ -90,38 +103,145 @@ class Run:
         return (self.checkpoint / "progress.json").exists()
 
 
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Turn what is raised over a missing, damaged or foreign file of a run into one line that names it.
+
+    Raises:
+        CheckpointError: instead of it.
+    """
+    remedy = "copy the run again, or take it from a backup"
+    try:
+        yield
+    except CheckpointError:
+        raise
+    except FileNotFoundError as error:
+        raise CheckpointError(f"{path}: expected a file of the run, found no such file; {remedy}") from error
+    except _DAMAGE as error:
+        why = f"lacks {error}" if isinstance(error, KeyError) else " ".join(str(error).split())
+        raise CheckpointError(
+            f"{path}: expected a file as dsar writes it, found {path.stat().st_size} bytes that are damaged "
+            f"or something else ({why or type(error).__name__}); {remedy}"
+        ) from error
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Return the object in a JSON file of a run."""
+    with reading(path):
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(content, dict):
+            raise TypeError(f"expected an object, found {type(content).__name__}")
+        return content
+
+
+def read_tensors(path: Path) -> dict[str, Tensor]:
+    """Return the tensors in a file of a run."""
+    with reading(path):
+        return _tensors(path.read_bytes())
+
+
+def _tensors(content: bytes) -> dict[str, Tensor]:
+    """Return the tensors of a file that was read: mapped to memory, it could be cut meanwhile.
+
+    Each is a copy: torch aligns those, and sums over what lies just anywhere differ in the last digit.
+    """
+    return {name: tensor.clone() for name, tensor in load_tensors(content).items()}
+
+
 def newest_run(root: Path = Path("runs")) -> Run:
     """Return the run with the newest checkpoint under `runs/`."""
     found = sorted(root.glob("*/checkpoint/progress.json"), key=lambda path: path.stat().st_mtime)
     if not found:
         raise CheckpointError(
-            f"no trained run under {root}/; name one, or train one: dsar train --preset demo"
+            f"no trained run under {root.absolute()}; name one, or train one: dsar train --preset demo"
         )
     return Run(found[-1].parent.parent)
 
 
-def load_checkpoint(run: Run) -> tuple[Avatar, TrainConfig, dict[str, str]]:
-    """Return the trained avatar of a run, its settings, and its provenance for exported files."""
-    if not run.exists:
-        raise CheckpointError(
-            f"{run.folder} holds no checkpoint; expected {run.checkpoint}/avatar.safetensors"
-        )
+def read_config(run: Run) -> TrainConfig:
+    """Return the settings of a run, capture and body where they lie now.
+
+    A path that is no more is looked for where it lay as seen from the run's folder: both may have been moved
+    together. One that is relative (older runs have such) is looked for in the current folder, then in the
+    folders that hold the run.
+    """
     try:
         config = config_from_json(run.config)
     except ConfigError as error:
         raise CheckpointError(str(error)) from error
-    progress = read_progress(run)
+    capture = config.capture if config.capture == EMBEDDED else _located(run, config.capture, "capture")
+    body = None if config.body is None else _located(run, config.body, "body file")
+    return dataclasses.replace(config, capture=capture, body=body)
+
+
+def _located(run: Run, recorded: str, what: str) -> str:
+    """Return the absolute path at which something that a run refers to lies now; where it lay, if nowhere."""
+    path, folder = Path(recorded), run.folder.resolve()
+    candidates = [path.resolve()]
+    if not path.is_absolute():
+        candidates += [above / path for above in folder.parents]
+    elif run.exists and (then := read_progress(run).get("folder")):
+        candidates.append((folder / os.path.relpath(path, then)).resolve())
+    found = next((each for each in candidates if each.exists()), candidates[0])
+    if found != candidates[0]:
+        LOGGER.warning("Run %s: its %s is not at %s, but at %s", run.folder, what, candidates[0], found)
+    return str(found)
+
+
+def load_checkpoint(run: Run) -> tuple[Avatar, TrainConfig, dict[str, str]]:
+    """Return the trained avatar of a run, its settings, and its provenance for exported files.
+
+    Moving or renaming the run changes none of them but the places of capture and body.
+
+    Raises:
+        CheckpointError: there is no checkpoint, or one of its files is damaged, foreign or not finite.
+    """
+    if not run.exists:
+        raise CheckpointError(f"{_without_checkpoint(run)}; expected {run.checkpoint}/avatar.safetensors")
+    config, progress = read_config(run), read_progress(run)
     path = run.checkpoint / "avatar.safetensors"
-    tensors = load_file(path)
+    with reading(path):
+        content = path.read_bytes()
+        avatar = _avatar(_tensors(content), config, path)
+    name = Path(progress["folder"]).name if "folder" in progress else run.folder.resolve().name
+    digest = hashlib.sha256(content).hexdigest()[:16]
+    return avatar, config, {"checkpoint": digest, "run": name, "step": str(progress["step"])}
+
+
+def _without_checkpoint(run: Run) -> str:
+    """Return what is in the place of a run that holds no checkpoint."""
+    if not run.folder.is_dir():
+        return f"{run.folder}: {'a file, no run folder' if run.folder.exists() else 'no such folder'}"
+    left = run.folder / "checkpoint.old"
+    if left.is_dir():
+        return f"{run.folder} holds no checkpoint, but {left.name} of a crash: rename it to checkpoint"
+    return f"{run.folder} holds no checkpoint"
+
+
+def _avatar(tensors: dict[str, Tensor], config: TrainConfig, path: Path) -> Avatar:
+    """Return the avatar that a checkpoint's tensors make."""
+    for name, values in tensors.items():
+        bad = int((~values.isfinite()).sum()) if values.is_floating_point() else 0
+        if bad:
+            raise CheckpointError(
+                f"{path}: {name} has {bad} values that are not finite: training diverged, or the file is "
+                "damaged; train again, or take the run from a backup"
+            )
     body = Body(parents=PARENTS, **{name: tensors[f"body_{name}"] for name in _BODY})
     height, width = (int(size) for size in tensors.pop("atlas_size"))
     fields = ("positions", "weights", "frames", "tangents", "hidden")
     atlas = Atlas(height, width, tensors["texels"], *(tensors[f"texel_{name}"] for name in fields))
     avatar = Avatar(body, atlas, config.model, float(tensors.pop("fps")))
+    expected = {name: tuple(value.shape) for name, value in avatar.state_dict().items()}
+    found = {name: tuple(value.shape) for name, value in tensors.items()}
+    for name in sorted(expected.keys() | found.keys()):
+        if expected.get(name) != found.get(name):
+            raise CheckpointError(
+                f"{path}: {name} has shape {found.get(name, 'none')}, by config.json "
+                f"{expected.get(name, 'none')}; one of the two files is of another run: copy both from one"
+            )
     avatar.load_state_dict(tensors)
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()[:16]
-    provenance = {"checkpoint": digest, "run": run.folder.name, "step": str(progress["step"])}
-    return avatar.eval(), config, provenance
+    return avatar.eval()
 
 
 def save_avatar(avatar: Avatar, folder: Path) -> None:
@@ -144,10 +264,15 @@ def load_optimizers(optimizers: Mapping[str, torch.optim.Optimizer], folder: Pat
     """Restore what `save_optimizers` wrote."""
     for label, optimizer in optimizers.items():
         state: dict[int, dict[str, Tensor]] = {}
-        for key, value in load_file(folder / f"{label}.safetensors").items():
-            index, name = key.split(".", 1)
-            state.setdefault(int(index), {})[name] = value
-        optimizer.load_state_dict({**optimizer.state_dict(), "state": state})
+        path = folder / f"{label}.safetensors"
+        parameters = [each for group in optimizer.param_groups for each in group["params"]]
+        with reading(path):
+            for key, value in read_tensors(path).items():
+                index, name = key.split(".", 1)
+                if value.ndim and value.shape != parameters[int(index)].shape:
+                    raise ValueError(f"{key} has shape {tuple(value.shape)}, its parameter another")
+                state.setdefault(int(index), {})[name] = value
+            optimizer.load_state_dict({**optimizer.state_dict(), "state": state})
 
 
 def save_rollouts(folder: Path, rank: int, tensors: Mapping[str, Tensor], places: Any) -> None:
@@ -169,7 +294,9 @@ def load_rollouts(folder: Path, rank: int) -> tuple[dict[str, Tensor], Any]:
     path = folder / f"rollouts-{rank}.safetensors"
     if not path.exists():
         raise CheckpointError(f"{folder} has no state of worker {rank}; resume with the run's own --workers")
-    return load_file(path), json.loads((folder / f"rollouts-{rank}.json").read_text())
+    places = folder / f"rollouts-{rank}.json"
+    with reading(places):
+        return read_tensors(path), json.loads(places.read_text(encoding="utf-8"))
 
 
 def save_registration(folder: Path, rank: int, tensors: Mapping[str, Tensor]) -> None:
@@ -179,23 +306,45 @@ def save_registration(folder: Path, rank: int, tensors: Mapping[str, Tensor]) ->
 
 def load_registration(folder: Path, rank: int) -> dict[str, Tensor]:
     """Restore what `save_registration` wrote."""
-    return load_file(folder / f"registration-{rank}.safetensors")
+    return read_tensors(folder / f"registration-{rank}.safetensors")
 
 
-def save_progress(folder: Path, step: int, progress: float) -> None:
+def save_progress(folder: Path, step: int, progress: float, run: Run) -> None:
     """Write where the run stands; written last, it marks a checkpoint as complete."""
     content = {"format_version": FORMAT_VERSION, "step": step, "progress": progress}
+    # What the run refers to by path is found again from here, when all of it is moved.
+    content |= {"folder": str(run.folder.resolve())}
     (folder / "progress.json").write_text(json.dumps(content))
 
 
 def read_progress(run: Run) -> dict[str, Any]:
-    """Return step and progress of a run's checkpoint."""
-    content = json.loads((run.checkpoint / "progress.json").read_text())
-    if content["format_version"] != FORMAT_VERSION:
+    """Return step and progress of a run's checkpoint, and in new ones the run's folder at that time."""
+    path = run.checkpoint / "progress.json"
+    content = read_json(path)
+    if content.get("format_version", FORMAT_VERSION) != FORMAT_VERSION:
         raise CheckpointError(
             f"{run.checkpoint} has format {content['format_version']}, this version reads {FORMAT_VERSION}"
         )
+    kinds = {"format_version": int, "step": int, "progress": int | float, "folder": str}
+    with reading(path):
+        for key, kind in kinds.items():
+            if not isinstance(content.get(key, "" if key == "folder" else None), kind):
+                raise TypeError(f"{key} is {content.get(key)!r}")
     return content
+
+
+def check_files(run: Run) -> None:
+    """Read every file of a checkpoint, before workers do that would wait for one that fails.
+
+    Raises:
+        CheckpointError: one is damaged.
+    """
+    for path in sorted(run.checkpoint.iterdir()):
+        if path.suffix == ".safetensors":
+            read_tensors(path)
+        elif path.suffix == ".json":
+            with reading(path):
+                json.loads(path.read_text(encoding="utf-8"))
 
 
 def replace_folder(new: Path, final: Path) -> None:

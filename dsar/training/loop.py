@@ -1,6 +1,7 @@
 """The training loop: read it from top to bottom."""
 
 import dataclasses
+import logging
 import shutil
 import signal
 import time
@@ -15,7 +16,7 @@ from torch import nn
 
 from dsar.avatar.avatar import Avatar
 from dsar.avatar.stillness import stillest_frames
-from dsar.config import TrainConfig, config_from_json, config_to_json
+from dsar.config import TrainConfig, config_to_json, with_absolute_paths
 from dsar.data.capture import capture_of
 from dsar.data.multiview import MultiViewCapture
 from dsar.drafts import storing, write_whole
@@ -29,10 +30,12 @@ from dsar.training.optimizers import make_optimizers, set_rates
 from dsar.training.registration import Registration
 from dsar.training.report import REPORT_EVERY, Monitor, Reporter
 from dsar.training.rest import RestShapes
+from dsar.training.scene import read_scene, scene_of_capture, write_scene
 from dsar.training.segment import Progress, SegmentTrainer
 from dsar.training.stages import Position, position
 from dsar.types import Capture
 
+_log = logging.getLogger(__name__)
 SAVE_EVERY = 200
 """Updates between checkpoints (not seconds: all workers must agree)."""
 STILL_FRAMES = 16
@@ -51,23 +54,27 @@ def train(config: TrainConfig, run: Run, *, resume: bool = False, report: Report
             TrainingError when a value stops being finite.
     """
     config.validate()
-    if resume and run.exists and config.body is None:
+    if run.exists and not resume:
+        raise CheckpointError(f"{run.folder} holds a run already; go on with --resume, or give another --out")
+    if resume and not run.exists:
+        raise CheckpointError(f"{run.folder} holds no checkpoint to resume; leave --resume out")
+    config = with_absolute_paths(config)
+    if resume and config.body is None:
         # What came from the environment was written down, and the environment may be another now.
-        config = dataclasses.replace(config, body=config_from_json(run.config).body)
-    capture = capture_of(config).with_cameras(config.cameras)
+        config = dataclasses.replace(config, body=ckpt.read_config(run).body)
+    whole = capture_of(config)
+    capture = whole.with_cameras(config.cameras)
     if config.schedule.views > len(capture.cameras):
         raise ConfigError(
             f"schedule.views is {config.schedule.views}; there are {len(capture.cameras)} cameras"
         )
     config = with_body(config, capture)
-    if run.exists and not resume:
-        raise CheckpointError(f"{run.folder} holds a run already; go on with --resume, or give another --out")
-    if resume and not run.exists:
-        raise CheckpointError(f"{run.folder} holds no checkpoint to resume; leave --resume out")
     if resume:
-        check_same_settings(config, config_from_json(run.config), run)
+        ckpt.check_files(run)
+        check_same_settings(config, resumed_settings(run, config, whole), run)
     done = ckpt.read_progress(run)["progress"] if resume else 0.0
     check_budget(config, workers.here(config.workers), done, capture.kept_bytes)
+    write_scene(run.scene, scene_of_capture(whole))
     write_whole(run.config, config_to_json(config))
     workers.run_workers(config.workers, _train, (config, run.folder, resume), report)
     return run
@@ -79,6 +86,17 @@ def with_body(config: TrainConfig, capture: MultiViewCapture) -> TrainConfig:
     if config.body is not None or path is None or path.resolve().is_relative_to(capture.root.resolve()):
         return config
     return dataclasses.replace(config, body=str(path.resolve()))
+
+
+def resumed_settings(run: Run, config: TrainConfig, capture: MultiViewCapture) -> TrainConfig:
+    """Return the settings of a run; with the capture that is given now, if it is the same, moved."""
+    saved = ckpt.read_config(run)
+    if config.capture != saved.capture and run.scene.exists():
+        if not read_scene(run.scene).is_of(scene_of_capture(capture)):
+            return saved
+        _log.info("Run %s: its capture was %s and is %s now", run.folder, saved.capture, config.capture)
+        return dataclasses.replace(saved, capture=config.capture)
+    return saved
 
 
 def check_same_settings(config: TrainConfig, saved: TrainConfig, run: Run) -> None:
@@ -114,8 +132,10 @@ def _train(config: TrainConfig, folder: Path, resume: bool, report: Reporter | N
         at = ckpt.read_progress(run)
         step, progress = at["step"], at["progress"]
         ckpt.load_optimizers(optimizers, run.checkpoint)
-        trainer.carry_on(*ckpt.load_rollouts(run.checkpoint, workers.rank()))
-        registration.carry_on(ckpt.load_registration(run.checkpoint, workers.rank()))
+        with ckpt.reading(run.checkpoint / f"rollouts-{workers.rank()}.safetensors"):
+            trainer.carry_on(*ckpt.load_rollouts(run.checkpoint, workers.rank()))
+        with ckpt.reading(run.checkpoint / f"registration-{workers.rank()}.safetensors"):
+            registration.carry_on(ckpt.load_registration(run.checkpoint, workers.rank()))
         trainer.registered = registration.result
     clock, used, stop = Clock(schedule.minutes), 0.0, False
     monitor = Monitor(run.metrics, schedule.steps, report, began=progress)
@@ -250,7 +270,7 @@ def save(
         ckpt.save_registration(folder, workers.rank(), registration.carried())
         workers.barrier()
         if workers.rank() == 0:
-            ckpt.save_progress(folder, step, progress)
+            ckpt.save_progress(folder, step, progress, run)
             ckpt.replace_folder(folder, run.checkpoint)
         workers.barrier()
 

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import logging
 import math
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -68,8 +69,12 @@ class Monitor:
         """Append a line of smoothed values to metrics.jsonl and show it to the listener."""
         assert self._smoothed is not None
         line = self._line(step, progress, stage, seconds, self._smoothed)
-        with storing(self._metrics), self._metrics.open("a") as file:
-            file.write(json.dumps(dataclasses.asdict(line)) + "\n")
+        with storing(self._metrics), self._metrics.open("ab+") as file:
+            # What a killed run has left of a line stays one by itself.
+            whole = file.tell() == 0 or (file.seek(-1, os.SEEK_END) >= 0 and file.read(1) == b"\n")
+            file.write(
+                ("" if whole else "\n").encode() + json.dumps(dataclasses.asdict(line)).encode() + b"\n"
+            )
         if self._reporter is not None:
             self._reporter(line)
 

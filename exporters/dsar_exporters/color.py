@@ -4,9 +4,9 @@ The conversion happens once, after blending, on colours freed of their alpha; co
 premultiplied value instead would darken every soft edge.
 """
 
-import hashlib
 import os
-from dataclasses import dataclass
+import socket
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from jaxtyping import Float32
 
 from dsar.color import linear_from_srgb
 from dsar.errors import ExportError
+from dsar_exporters.ocio_files import hash_config
 from dsar_exporters.optional import require
 
 LINEAR_REC709 = "lin_rec709_scene"
@@ -40,18 +41,18 @@ class ColorTarget:
     """`lin_rec709_scene`, or any name, alias or role of the configuration."""
     config: str = _BUILT_IN
     """An OCIO configuration's file, or the name of a built-in one."""
+    contents: str = field(init=False)
+    """A hash of what the configuration says, with the look-up tables that it names, where this was made."""
 
     def __post_init__(self) -> None:
         """Look the colour space up, so that a wrong name is found before any work."""
         _ = self.interop_id
+        object.__setattr__(self, "contents", hash_config(self.config))
 
     @property
     def key(self) -> str:
-        """All that colours depend on: of a configuration's file its contents, not those of files it names."""
-        file = Path(self.config)
-        # Machines mount folders where they like.
-        config = hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else self.config
-        return repr((self.colorspace, config))
+        """All that colours depend on, but no paths: machines mount folders where they like."""
+        return repr((self.colorspace, self.contents))
 
     @property
     def interop_id(self) -> str:
@@ -59,11 +60,16 @@ class ColorTarget:
         return _interop_id(self.colorspace, self.config)
 
     def from_display(self, straight: Float32[np.ndarray, "*n 3"]) -> Float32[np.ndarray, "*n 3"]:
-        """Return display-referred sRGB, not premultiplied, in this colour space."""
+        """Return display-referred sRGB, not premultiplied, in this colour space.
+
+        Raises:
+            ExportError: This process, maybe of another machine, has another configuration in that place.
+        """
         linear = linear_from_srgb(straight)
         # Without a configuration of the user's, Rec.709 needs none.
         if (self.colorspace, self.config) == (LINEAR_REC709, _BUILT_IN):
             return linear
+        _check_contents(self.config, self.contents)
         return _converted(straight, self.colorspace, self.config)
 
     def premultiplied(
@@ -83,9 +89,24 @@ class ColorTarget:
         return result
 
 
-def ocio_config(path: Path | None) -> str:
+def ocio_config(path: Path | str | None) -> str:
     """Return the configuration to use: the one named, else $OCIO's, else the built-in default."""
     return str(path) if path is not None else os.environ.get("OCIO") or _BUILT_IN
+
+
+@lru_cache
+def _check_contents(config: str, contents: str) -> None:
+    """Check, once a process, that a configuration is what it was where the work was given out."""
+    if not config.startswith("ocio://") and not Path(config).is_file():
+        raise ExportError(
+            f"--ocio {config}: no such file on {socket.gethostname()}; put the configuration where all "
+            "machines see it"
+        )
+    if hash_config(config) != contents:
+        raise ExportError(
+            f"--ocio {config}: it, files or variables that it refers to are others on {socket.gethostname()} "
+            "than where the render was started; put the configuration where all machines see it"
+        )
 
 
 @lru_cache

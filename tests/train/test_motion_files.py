@@ -5,14 +5,14 @@ import pytest
 import torch
 from skeletons import LAFAN1, XSENS, world_joints, write_layout
 
-from dsar.cli.drive import Drive
+from dsar.cli.export import Export
 from dsar.data.motion import write_motion
 from dsar.errors import ConfigError, MotionError
 
 
 @pytest.fixture(scope="module")
 def performance(trained):
-    return Drive(run_folder=trained, motion="test").open()
+    return Export(run_folder=trained, motion="test").open()
 
 
 def written(path, motion, **changes):
@@ -26,7 +26,7 @@ def test_y_up_and_z_up_files_of_a_motion_give_the_same_gaussians(trained, perfor
     motion, body = performance.motion, performance.avatar.body
     write_motion(tmp_path / "z_up.npz", motion, body)
     files = [str(tmp_path / "z_up.npz"), written(tmp_path / "y_up.npz", motion)]
-    rolls = [Drive(run_folder=trained, motion=file).open().roll_out() for file in files]
+    rolls = [Export(run_folder=trained, motion=file).open().roll_out() for file in files]
     for (_, first), (_, second), (_, expected) in zip(*rolls, performance.roll_out(), strict=True):
         for gaussians in (first, second):
             assert torch.allclose(gaussians.means, expected.means, atol=1e-5)
@@ -38,7 +38,7 @@ def test_a_bvh_drives_an_avatar_to_the_joints_of_the_motion_it_was_made_from(
 ):
     motion, body = performance.motion, performance.avatar.body
     path = write_layout(tmp_path / "clip.bvh", layout, body, motion)
-    driven = Drive(run_folder=trained, motion=str(path)).open().motion
+    driven = Export(run_folder=trained, motion=str(path)).open().motion
     (_, places), (_, expected) = (world_joints(body, each) for each in (driven, motion))
     # The clip bends from its first frame on: nothing is taken for a rest pose.
     assert np.linalg.norm(places - expected, axis=-1)[:, :22].max() < 0.02
@@ -47,14 +47,14 @@ def test_a_bvh_drives_an_avatar_to_the_joints_of_the_motion_it_was_made_from(
 def test_flags_of_motion_files_are_read_and_refused_beside_a_sequence(trained, performance, tmp_path):
     path = written(tmp_path / "walk.npz", performance.motion, mocap_frame_rate=None)
     with pytest.raises(MotionError, match="say it with --motion-fps"):
-        Drive(run_folder=trained, motion=path).open()
-    driven = Drive(run_folder=trained, motion=path, up="y", motion_fps=30.0).open().motion
+        Export(run_folder=trained, motion=path).open()
+    driven = Export(run_folder=trained, motion=path, up="y", motion_fps="30").open().motion
     assert torch.equal(driven.rotations, performance.motion.rotations)
     with pytest.raises(ConfigError, match="--up, --motion-fps: for motion files; bend is a sequence"):
-        Drive(run_folder=trained, motion="bend", up="y", motion_fps=30.0).open()
+        Export(run_folder=trained, motion="bend", up="y", motion_fps="30").open()
 
 
 def test_a_figure_that_lies_is_noticed_before_anything_is_drawn(trained, performance, tmp_path, caplog):
     path = written(tmp_path / "walk.npz", performance.motion)
-    Drive(run_folder=trained, motion=path, up="z").open()
+    Export(run_folder=trained, motion=path, up="z").open()
     assert "Motion walk: the figure lies; if it should stand, say --up y or --up z" in caplog.text

@@ -11,8 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from dsar.config import PRESETS, TrainConfig, config_to_json
-from dsar.data.capture import capture_of
+from dsar.config import PRESETS, TrainConfig, absolute_capture, config_to_json
 from dsar.drafts import write_whole
 from dsar.errors import ConfigError
 from dsar.evaluation.heldout import evaluate
@@ -22,6 +21,7 @@ from dsar.network import STREAMS, Stream
 from dsar.training.checkpoint import Run, load_checkpoint, read_progress
 from dsar.training.loop import train
 from dsar.training.report import Report
+from dsar.training.scene import open_images, open_scene
 
 _MEASURING = 2
 """Minutes that measuring a model takes on two cores, about."""
@@ -85,7 +85,9 @@ class Study:
         """
         config = PRESETS[self.preset]
         schedule = dataclasses.replace(config.schedule, steps=_ENOUGH, minutes=self.minutes)
-        config = dataclasses.replace(config, capture=self.capture, seed=model.seed, schedule=schedule)
+        config = dataclasses.replace(
+            config, capture=absolute_capture(self.capture), seed=model.seed, schedule=schedule
+        )
         for key, value in model.settings.items():
             section, _, name = key.rpartition(".")
             owner = getattr(config, section) if section else config
@@ -154,6 +156,11 @@ class Study:
         return run.exists and read_progress(run)["progress"] >= 1
 
     def _check(self, path: Path, settings: Any, model: Model) -> None:
+        if isinstance(settings, dict) and isinstance(settings.get("capture"), str):
+            settings = {
+                **settings,
+                "capture": absolute_capture(settings["capture"]),
+            }  # older ones were relative
         if settings != json.loads(config_to_json(self.config(model))):
             raise ConfigError(
                 f"{path} is of a model with other settings than this study's ({self.minutes:g} minutes, "
@@ -163,7 +170,7 @@ class Study:
     def _measure(self, each: Measurement) -> None:
         model, run = each.model, self._run(each.model)
         avatar, config, provenance = load_checkpoint(run)
-        capture = capture_of(config)
+        capture = open_images(run, config)
         streams: list[Stream] = [stream for stream in STREAMS if stream not in each.zeroed]
         found = {
             "config": json.loads(config_to_json(config)),
@@ -182,10 +189,11 @@ class Study:
 
 def _stress(folder: Path, cases: Mapping[str, Case]) -> dict[str, Any]:
     """Return the verdicts on a run, by case."""
-    avatar, config, _ = load_checkpoint(Run(folder))
-    capture = capture_of(config)
-    far = (capture.splits.get("fd") or capture.splits["test"])[0]
-    return {name: verdict.to_json() for name, verdict in stress(avatar, capture.motions[far], cases)}
+    run = Run(folder)
+    avatar, config, _ = load_checkpoint(run)
+    scene = open_scene(run, config)
+    far = (scene.splits.get("fd") or scene.splits["test"])[0]
+    return {name: verdict.to_json() for name, verdict in stress(avatar, scene.motions[far], cases)}
 
 
 def _follow(report: Reporter, what: str, done: int, needed: int, line: Report) -> None:

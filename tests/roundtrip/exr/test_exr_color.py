@@ -1,5 +1,6 @@
 """Colour spaces."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -105,7 +106,38 @@ def test_a_configuration_that_changes_is_another_job(config, tmp_path):
     before = ExrSequence(tmp_path, target=target).key
     assert ExrSequence(tmp_path, target=ColorTarget("Dim", str(config))).key == before
     config.write_text(OCIO.replace("0.5, 0, 0, 0", "0.4, 0, 0, 0"))
-    assert ExrSequence(tmp_path, target=target).key != before
+    assert ExrSequence(tmp_path, target=ColorTarget("Dim", str(config))).key != before
+    with pytest.raises(ExportError, match=r"studio\.ocio: it, .* are others on"):
+        target.from_display(np.array([[0.5, 0.2, 0.1]], np.float32))
+
+
+WITH_TABLE = f"""{OCIO.replace("environment: {}", "environment: {LOOK: warm}")}
+  - !<ColorSpace>
+    name: Graded
+    from_scene_reference: !<FileTransform> {{src: "$LOOK.spi1d", interpolation: linear}}
+search_path: luts
+"""
+TABLE = "Version 1\nFrom 0.0 1.0\nLength 2\nComponents 1\n{{\n0.0\n{}\n}}\n"
+
+
+def test_tables_and_variables_that_a_configuration_refers_to_are_part_of_the_job(tmp_path, monkeypatch):
+    (tmp_path / "luts").mkdir()
+    for name, top in (("warm", 0.9), ("cold", 0.8)):
+        (tmp_path / "luts" / f"{name}.spi1d").write_text(TABLE.format(top))
+    path = tmp_path / "show.ocio"
+    path.write_text(WITH_TABLE)
+    monkeypatch.delenv("LOOK", raising=False)
+    default = ColorTarget("Graded", str(path)).key
+    monkeypatch.setenv("LOOK", "cold")
+    cold = ColorTarget("Graded", str(path)).key
+    monkeypatch.setenv("LOOK", "warm")
+    assert ColorTarget("Graded", str(path)).key == default != cold
+    (tmp_path / "luts" / "warm.spi1d").write_text(TABLE.format(0.7))
+    assert ColorTarget("Graded", str(path)).key != default
+    elsewhere = tmp_path / "elsewhere"
+    shutil.copytree(tmp_path / "luts", elsewhere / "luts")
+    shutil.copy(path, elsewhere)
+    assert ColorTarget("Graded", str(elsewhere / "show.ocio")).key == ColorTarget("Graded", str(path)).key
 
 
 def test_soft_edges_keep_their_colour_in_every_space(small, tmp_path):
