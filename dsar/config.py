@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, cast, get_args, get_origin, get_type_hints
 
 from dsar.errors import ConfigError
+from dsar.text import read_json
 
 EMBEDDED = "embedded"
 """Stands for the capture that comes with the package, in place of a folder."""
@@ -327,14 +328,7 @@ def config_from_json(path: Path) -> TrainConfig:
         ConfigError: it cannot be read, a setting is unknown, missing or of another kind, or settings
             contradict each other.
     """
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise ConfigError(f"{path}: expected the settings of a run, found no such file") from error
-    except ValueError as error:
-        raise ConfigError(
-            f"{path}: expected the settings of a run as JSON, found a damaged file or another ({error})"
-        ) from error
+    values = read_json(path, ConfigError)
     try:
         config = _from_values(TrainConfig, values, "")
         config.validate()

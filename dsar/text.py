@@ -14,11 +14,19 @@ def read_text(path: Path, error: type[Exception]) -> str:
         error: Raised, with a message, where it cannot be read.
     """
     try:
-        data = path.read_bytes()
-        wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
-        text = data.decode("utf-16" if wide else "utf-8-sig")
+        return decode_text(path.read_bytes())
     except (OSError, UnicodeDecodeError) as cause:
         raise error(f"{path}: cannot be read as text ({cause})") from cause
+
+
+def decode_text(data: bytes) -> str:
+    """Return the text in bytes, without its byte-order mark and with line ends as newlines.
+
+    Raises:
+        UnicodeDecodeError: it is none in UTF-8, or in what its byte-order mark says.
+    """
+    wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    text = data.decode("utf-16" if wide else "utf-8-sig")
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 

@@ -1,6 +1,5 @@
 """Motion capture in .bvh files, whoever wrote them: a hierarchy of joints and their channels by frame."""
 
-import codecs
 import logging
 import re
 from dataclasses import dataclass, field
@@ -14,10 +13,10 @@ from torch import Tensor
 from dsar.errors import MotionError
 from dsar.geometry.rates import same_rate
 from dsar.geometry.rotations import matrix_from_axis_angle
+from dsar.text import decode_text
 
 _CHANNELS = {f"{axis}{kind}".lower(): f"{axis}{kind}" for axis in "XYZ" for kind in ("position", "rotation")}
 _POSITIONS = [f"{axis}position" for axis in "XYZ"]
-_BYTE_ORDER_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _STANDARD_RATES = (24000 / 1001, 30000 / 1001, 60000 / 1001, 120000 / 1001)
 _UNTURNED = 0.9
 """Share of a frame's rotations that are exactly zero: more are in a rest pose (CMU's turns legs and arms)."""
@@ -106,10 +105,8 @@ def read_bvh(path: Path, fps: float | None = None) -> Recording:
 
 def _decode(content: bytes) -> str:
     """Return the text; names of joints may be in any encoding, all else is ASCII."""
-    if content.startswith(_BYTE_ORDER_MARKS):
-        return content.decode("utf-16", errors="replace")
     try:
-        return content.decode("utf-8-sig")
+        return decode_text(content)
     except UnicodeDecodeError:
         return content.decode("latin-1")
 

@@ -6,7 +6,6 @@ coefficients are not read: the avatar moves with its own shape.
 
 import dataclasses
 import logging
-import os
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +18,7 @@ from dsar.data.orientation import Up, Uprightness, find_up, joint_places, quarte
 from dsar.data.poses import read_arrays, read_poses, read_rate
 from dsar.data.retarget import Clip, body_places, bones_of, leg_length, retarget, standing_rest
 from dsar.data.skeletons import Figure, find_figure
+from dsar.drafts import replacing
 from dsar.errors import MotionError
 from dsar.geometry.rates import exact_rate, same_rate
 from dsar.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
@@ -131,17 +131,16 @@ def write_motion(path: Path, motion: Motion, body: Body) -> None:
         body: the body that moves.
     """
     z_up = turn_motion(motion, body, quarter_turn("z").T)
-    temporary = path.with_name(f".{path.stem}.tmp.npz")
-    np.savez_compressed(
-        temporary,
-        poses=z_up.rotations.flatten(1).numpy(),
-        trans=z_up.translations.numpy(),
-        betas=np.zeros(16, np.float32),
-        gender=np.array("neutral"),
-        surface_model_type=np.array("smplx"),
-        mocap_frame_rate=np.array(motion.fps),
-    )
-    os.replace(temporary, path)
+    with replacing(path) as draft, draft.open("wb") as file:
+        np.savez_compressed(
+            file,
+            poses=z_up.rotations.flatten(1).numpy(),
+            trans=z_up.translations.numpy(),
+            betas=np.zeros(16, np.float32),
+            gender=np.array("neutral"),
+            surface_model_type=np.array("smplx"),
+            mocap_frame_rate=np.array(motion.fps),
+        )
 
 
 def turn_motion(motion: Motion, body: Body, rotation: Float[Tensor, "3 3"]) -> Motion:

@@ -16,6 +16,7 @@ from dsar.drafts import replacing
 from dsar.errors import ConfigError
 from dsar.geometry.paths import START_FRAME, CameraPath
 from dsar.geometry.rates import exact_rate, same_rate
+from dsar.text import read_json
 from dsar.types import Camera
 
 _logger = logging.getLogger(__name__)
@@ -68,13 +69,7 @@ def read_cameras_json(
 
 def _load(path: Path) -> Mapping[str, Any]:
     """Return a file's record, which has a list of cameras."""
-    try:
-        record = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise ConfigError(
-            f"{path}: expected cameras as JSON, found what cannot be read ({error}): give a file like "
-            "capture.json"
-        ) from error
+    record = read_json(path, ConfigError)
     entries = record.get("cameras") if isinstance(record, dict) else None
     if not isinstance(entries, list) or not entries:
         raise ConfigError(

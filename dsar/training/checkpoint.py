@@ -35,6 +35,7 @@ from dsar.body.atlas import Atlas
 from dsar.body.model import PARENTS
 from dsar.config import EMBEDDED, TrainConfig, config_from_json
 from dsar.errors import CheckpointError, ConfigError
+from dsar.text import decode_text
 from dsar.types import Body
 
 FORMAT_VERSION = 3
@@ -128,7 +129,7 @@ def reading(path: Path) -> Iterator[None]:
 def read_json(path: Path) -> dict[str, Any]:
     """Return the object in a JSON file of a run."""
     with reading(path):
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(decode_text(path.read_bytes()))
         if not isinstance(content, dict):
             raise TypeError(f"expected an object, found {type(content).__name__}")
         return content
@@ -296,7 +297,7 @@ def load_rollouts(folder: Path, rank: int) -> tuple[dict[str, Tensor], Any]:
         raise CheckpointError(f"{folder} has no state of worker {rank}; resume with the run's own --workers")
     places = folder / f"rollouts-{rank}.json"
     with reading(places):
-        return read_tensors(path), json.loads(places.read_text(encoding="utf-8"))
+        return read_tensors(path), json.loads(decode_text(places.read_bytes()))
 
 
 def save_registration(folder: Path, rank: int, tensors: Mapping[str, Tensor]) -> None:
@@ -344,7 +345,7 @@ def check_files(run: Run) -> None:
             read_tensors(path)
         elif path.suffix == ".json":
             with reading(path):
-                json.loads(path.read_text(encoding="utf-8"))
+                json.loads(decode_text(path.read_bytes()))
 
 
 def replace_folder(new: Path, final: Path) -> None:

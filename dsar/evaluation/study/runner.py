@@ -18,7 +18,7 @@ from dsar.evaluation.heldout import evaluate
 from dsar.evaluation.stress import CASES, Case, stress
 from dsar.evaluation.study.tables import Row, Table
 from dsar.network import STREAMS, Stream
-from dsar.training.checkpoint import Run, load_checkpoint, read_progress
+from dsar.training.checkpoint import Run, load_checkpoint, read_json, read_progress
 from dsar.training.loop import train
 from dsar.training.report import Report
 from dsar.training.scene import open_images, open_scene
@@ -125,7 +125,7 @@ class Study:
         """Return what was found of a row, a dictionary a seed; seeds that are missing are left out."""
         each = (Measurement(self._model(row, seed), row.zeroed) for seed in range(row.seeds))
         paths = [self._figures(one) for one in each]
-        return [json.loads(path.read_text()) for path in paths if path.exists()]
+        return [read_json(path) for path in paths if path.exists()]
 
     def _model(self, row: Row, seed: int) -> Model:
         # A row of the study's own length is the same model as one that names no length.
@@ -146,13 +146,13 @@ class Study:
     def _measured(self, each: Measurement) -> bool:
         path = self._figures(each)
         if path.exists():
-            self._check(path, json.loads(path.read_text()).get("config"), each.model)
+            self._check(path, read_json(path).get("config"), each.model)
         return path.exists()
 
     def _trained(self, model: Model) -> bool:
         run = self._run(model)
         if run.exists:
-            self._check(run.folder, json.loads(run.config.read_text()), model)
+            self._check(run.folder, read_json(run.config), model)
         return run.exists and read_progress(run)["progress"] >= 1
 
     def _check(self, path: Path, settings: Any, model: Model) -> None:
