@@ -7,7 +7,7 @@ from typing import Any
 
 import tyro
 
-from dsar.cli.common import Common
+from dsar.cli.common import Common, file_stem
 from dsar.config import PRESETS
 from dsar.console import Bar
 
@@ -51,7 +51,7 @@ class Check(Common):
             verdict = check_capture(capture, lambda what, share: bar.show(share, what))
         rows, columns = draw_overlays(capture)
         sheet = write_sheet(
-            self.sheet or _SHEETS / f"{capture.name}.png",
+            self.sheet or _SHEETS / f"{file_stem(capture.name)}.png",
             rows,
             columns=columns,
         )

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
@@ -85,6 +86,11 @@ class OnRun(Common):
         from dsar.training.checkpoint import newest_run
 
         return self.run_folder or newest_run().folder
+
+
+def file_stem(label: str) -> str:
+    """Return a label from a file, such as a capture's name, as the first part of a file's name."""
+    return re.sub(r"[^\w-]+", "_", label) or "_"
 
 
 def shown(sequence: GaussianSequence, style: ProgressStyle, title: str) -> GaussianSequence:

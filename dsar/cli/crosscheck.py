@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dsar.cli.common import OnRun, capture_sequence
+from dsar.cli.common import OnRun, capture_sequence, file_stem
 from dsar.console import Bar
 from dsar.errors import ConfigError
 
@@ -97,7 +97,7 @@ class Crosscheck(OnRun):
 
         if self.capture is not None:
             capture = open_capture(self.capture, body=self.body)
-            return capture, capture.body, None, _PAGES / f"{capture.name}.crosscheck.html"
+            return capture, capture.body, None, _PAGES / f"{file_stem(capture.name)}.crosscheck.html"
         run = Run(self.chosen_run())
         avatar, config, _ = load_checkpoint(run)
         scene = open_scene(run, config)

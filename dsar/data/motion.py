@@ -63,7 +63,8 @@ def read_motion(path: Path, body: Body, *, up: Up | None = None, fps: float | No
     rotations, translations = read_poses(path, arrays)
     told = Motion(rotations, translations, fps or read_rate(path, arrays), path.stem)
     found = _up(up) or find_up(joint_places(body, told), "z")
-    _report(path, found, f"{told.fps:g} fps")
+    if up is None:
+        _report(path, found, f"{told.fps:g} fps")
     return told if found.axis == "y" else turn_motion(told, body, quarter_turn(found.axis))
 
 

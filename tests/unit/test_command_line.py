@@ -1,10 +1,12 @@
 """What the command line makes of what is typed."""
 
 import dataclasses
+from pathlib import Path
 
 import pytest
 
 from dsar.cli import parse
+from dsar.cli.common import file_stem
 from dsar.cli.train import Train
 from dsar.config import PRESETS
 from dsar.training.report import Monitor
@@ -52,3 +54,12 @@ def test_the_time_left_is_judged_by_what_this_process_did(tmp_path):
     monitor.write(910, 0.91, "autoregressive", 10.0)
     assert lines[0].seconds_left is None
     assert lines[1].seconds_left == pytest.approx(90)
+
+
+def test_a_label_from_a_file_is_a_name_and_no_path():
+    for label in ("../../../evil", "/etc/passwd", "..", ".", "", "a/b\\c", "C:\\a", "a\0b", "Anna, take 2"):
+        stem = file_stem(label)
+        assert Path(stem).name == stem
+        assert stem not in (".", "..", "")
+        assert not set(stem) & set("/\\.:\0")
+    assert file_stem("Käte_動き-2") == "Käte_動き-2"
