@@ -15,8 +15,10 @@ def read_text(path: Path, error: type[Exception]) -> str:
     """
     try:
         return decode_text(path.read_bytes())
+    except FileNotFoundError as cause:
+        raise error(f"{path}: expected a file, found no such file") from cause
     except (OSError, UnicodeDecodeError) as cause:
-        raise error(f"{path}: cannot be read as text ({cause})") from cause
+        raise error(f"{path}: expected text, found what cannot be read as text ({cause})") from cause
 
 
 def decode_text(data: bytes) -> str:
@@ -41,4 +43,4 @@ def read_json(path: Path, error: type[Exception]) -> Any:
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as cause:
-        raise error(f"{path}: cannot be read as JSON ({cause})") from cause
+        raise error(f"{path}: expected JSON, found what cannot be read as JSON ({cause})") from cause

@@ -20,7 +20,9 @@ requires = [
     "tyro",
     "fileseq",
 ]
-variants = [["usd-26.3+", "openexr-3.3+", "openimageio-3+", "mmh3-4+", "plyfile", "gsply", "fourdgs"]]
+variants = [
+    ["usd-26.3+", "openexr-3.3+", "openimageio-3+", "mmh3-4+", "plyfile", "gsply", "fourdgs", "zstandard"]
+]
 build_command = "python -m pip install --no-deps --target {install_path}/python {root}"
 
 

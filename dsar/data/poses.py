@@ -42,6 +42,8 @@ _JOINTS_OF_KEY = {
 }
 _ROOT_KEYS, _BODY_KEYS = ("root_orient", "global_orient"), ("pose_body", "body_pose")
 _TRANSLATION_KEYS = ("trans", "transl")
+_WOUND = 4
+"""Joints beyond a full turn at once that tell degrees from radians."""
 _RATE_KEYS = ("mocap_frame_rate", "mocap_framerate", "fps")
 
 # What files under the name .npz really are, by their first bytes.
@@ -193,12 +195,14 @@ def _is_compressed(path: Path, key: str, values: np.ndarray) -> bool:
 
 
 def _check_radians(path: Path, rotations: Float[np.ndarray, "f 55 3"]) -> None:
-    """Raise where the angles of knees, elbows and their like go beyond a full turn in most frames."""
-    largest = np.median(np.linalg.norm(rotations[:, 1 : FACE_JOINTS.start], axis=2).max(axis=1))
-    if largest > 1.2 * 2 * np.pi:
+    """Raise where several joints of a body go beyond a full turn in most frames, as nobody's do."""
+    angles = np.linalg.norm(rotations[:, 1 : FACE_JOINTS.start], axis=2)
+    # One joint may: rotations that were made continuous add turns up.
+    least = np.median(np.sort(angles, axis=1)[:, -_WOUND])
+    if least > 1.2 * 2 * np.pi:
         raise MotionError(
-            f"motion file {path}: in most frames a joint turns by {largest:.0f} radians; the poses are in "
-            "degrees, it seems: convert them with numpy.deg2rad"
+            f"motion file {path}: in most frames {_WOUND} joints turn by {least:.0f} radians or more; the "
+            "poses are in degrees, it seems: convert them with numpy.deg2rad"
         )
 
 

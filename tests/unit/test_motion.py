@@ -188,7 +188,7 @@ def test_other_rotations_and_several_people_are_refused_by_name(
 
 def test_degrees_are_refused_by_name(body: Body, tmp_path: Path) -> None:
     arrays = amass()
-    with pytest.raises(MotionError, match=r"turns by \d+ radians; the poses are in degrees"):
+    with pytest.raises(MotionError, match=r"joints turn by \d+ radians or more; the poses are in degrees"):
         read_motion(write_npz(tmp_path / "m.npz", arrays | {"poses": np.rad2deg(arrays["poses"])}), body)
 
 
