@@ -13,8 +13,9 @@ from shutil import rmtree
 
 from dsar.errors import DsarError, StorageError
 
+_ROOM = "free some room there, or write elsewhere"
 _ADVICE = {
-    "free some room there, or write elsewhere": (errno.ENOSPC, errno.EDQUOT, errno.EFBIG),
+    _ROOM: (errno.ENOSPC, errno.EDQUOT, errno.EFBIG),
     "write elsewhere, or change its permissions": (errno.EACCES, errno.EPERM, errno.EROFS),
     "give another path": (errno.EISDIR, errno.ENOTDIR, errno.EEXIST, errno.ENAMETOOLONG, errno.ELOOP),
     "check that it is there": (errno.ENOENT,),
@@ -23,11 +24,15 @@ _ADVICE = {
         *(errno.EHOSTUNREACH, errno.ENETUNREACH, errno.ETIMEDOUT, errno.EREMOTEIO),
     ),
 }
+_SHORT = re.compile(r"\d+ requested and \d+ written")
+"""NumPy's words for a write that stopped short, which have no code."""
 _ADVICE_OF_CODE = {code: advice for advice, codes in _ADVICE.items() for code in codes}
 
 
 def explain(error: OSError) -> str:
     """Return in words what the system said, and what a person can do about it."""
+    if error.errno is None and _SHORT.search(str(error)):
+        return f"the disk did not take all of it: {_ROOM}"
     reason = os.strerror(error.errno) if error.errno else str(error)
     advice = _ADVICE_OF_CODE.get(error.errno or 0)
     return f"{reason}: {advice}" if advice else reason

@@ -4,6 +4,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from faults import full_disk, read_only
 
@@ -77,6 +78,14 @@ def test_what_libraries_quote_of_the_system_is_the_systems(tmp_path):
         raise RuntimeError("expected three channels")
     assert quoted_error("i/o error: FILE TOO LARGE (os error 27)").errno == errno.EFBIG
     assert quoted_error("nothing of the kind") is None
+
+
+def test_numpys_short_writes_are_a_disk_without_room(tmp_path):
+    path = tmp_path / "a.spz"
+    with full_disk(5000), pytest.raises(StorageError, match=r"a\.spz: cannot be written: .*: free some room"):
+        with replacing(path) as draft:
+            np.zeros(8000, np.uint8).tofile(draft)
+    assert not list(tmp_path.iterdir())
 
 
 def test_what_is_read_while_a_file_is_written_has_its_own_name(tmp_path):
