@@ -26,6 +26,8 @@ _ADVICE = {
 }
 _SHORT = re.compile(r"\d+ requested and \d+ written")
 """NumPy's words for a write that stopped short, which have no code."""
+_BUFFER = 16384
+"""Bytes that libraries hold back until they close a file, at most."""
 _ADVICE_OF_CODE = {code: advice for advice, codes in _ADVICE.items() for code in codes}
 
 
@@ -94,7 +96,23 @@ def replacing(path: Path) -> Iterator[Path]:
         with tempfile.TemporaryDirectory(prefix=prefix, dir=path.parent) as folder:
             draft = Path(folder) / "draft"
             yield draft
+            _check_end(draft)
             os.replace(draft, path)
+
+
+def _check_end(draft: Path) -> None:
+    """Raise OSError where a disk takes nothing behind a file: then the file may lack its end.
+
+    Libraries in C write the last few kilobytes when they close a file, and seldom look how that went.
+    """
+    with draft.open("ab", buffering=0) as file:
+        end = file.tell()
+        try:
+            taken = file.write(bytes(_BUFFER))
+        finally:
+            file.truncate(end)
+    if taken < _BUFFER:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def write_whole(path: Path, text: str) -> None:

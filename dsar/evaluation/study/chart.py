@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from dsar.drafts import replacing
 from dsar.errors import MissingDependencyError
 
 PAPER = {
@@ -128,8 +129,8 @@ def draw_chart(
     # Places in the picture are known only now.
     for column, quality in enumerate(QUALITIES):
         _name_models(panels[0][column], points, quality)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)
+    with replacing(path) as draft:
+        figure.savefig(draft, format=path.suffix.lstrip(".").lower() or None)
     return path
 
 
