@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from faults import full_disk
 from pxr import Usd
 
 from dsar.errors import ExportError, StorageError
@@ -221,6 +222,17 @@ def test_a_full_disk_leaves_whole_splat_files_only(tmp_path):
     assert "ply: cannot be written: File too large" in message
     assert not list((tmp_path / "ply").iterdir())
     assert not list(tmp_path.glob("*a.usda*"))
+
+
+@pytest.mark.parametrize("kind", range(1, 5), ids=["ply", "compressed", "spz", "glb"])
+@pytest.mark.parametrize("missing", [1, 500])
+def test_a_disk_that_takes_all_but_the_end_is_noticed(make_sequence, tmp_path, kind, missing):
+    """Libraries in C do not look whether the last kilobytes of a file were taken when they close it."""
+    export(make_sequence(frames=1), [every_format(tmp_path / "whole")[kind]])
+    size = max(path.stat().st_size for path in (tmp_path / "whole").rglob("*") if path.suffix != ".json")
+    with full_disk(size - missing), pytest.raises(StorageError, match="free some room"):
+        export(make_sequence(frames=1), [every_format(tmp_path / "cut")[kind]])
+    assert not [path for path in (tmp_path / "cut").rglob("*") if path.is_file()]
 
 
 def test_an_output_that_cannot_be_finished_does_not_take_the_others_with_it(
