@@ -1,11 +1,13 @@
 """Files of a run that are cut, empty, foreign or missing: one line that names the file, and exit code 2."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
 import pytest
 import torch
+from PIL import Image
 from safetensors.torch import load_file, save_file
 
 import dsar
@@ -229,3 +231,33 @@ def test_what_is_no_run_is_said_to_be_what_it_is(run, tmp_path):
     shutil.move(run / "checkpoint", run / "checkpoint.old")
     with pytest.raises(CheckpointError, match=r"checkpoint\.old of a crash: rename it"):
         dsar.load(run)
+
+
+@pytest.mark.parametrize("damage", ["html", "cut", "small"])
+def test_check_train_and_eval_give_the_same_reason_for_the_same_images(
+    run, tiny_capture, tmp_path, capsys, damage
+):
+    capture = tmp_path / "capture"
+    shutil.copytree(tiny_capture, capture)
+    settings = json.loads((run / "config.json").read_text()) | {"capture": str(capture)}
+    (run / "config.json").write_text(json.dumps(settings))
+    for path in capture.glob("images/*/*/*.png"):
+        if damage == "html":
+            path.write_text("<html>404</html>")
+        elif damage == "cut":
+            path.write_bytes(path.read_bytes()[:-200])
+        else:
+            Image.open(path).resize((24, 32)).save(path)
+    said = []
+    for arguments in (
+        ["check", str(capture), "--sheet", str(tmp_path / "s.png"), "--progress", "none"],
+        train_arguments(capture, tmp_path / "new", "--steps", "2", "--workers", "1"),
+        ["eval", str(run), "--progress", "none"],
+    ):
+        with pytest.raises(SystemExit) as stop:
+            main(arguments)
+        assert stop.value.code == 2
+        said += re.findall(r"image \S+? in \S+?: (.*)", capsys.readouterr().err)[-1:]
+    assert len(said) == 3
+    # They may meet an image of another camera first.
+    assert len({re.sub(r"cam\d", "", line) for line in said}) == 1, said
