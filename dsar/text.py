@@ -15,7 +15,9 @@ def read_text(path: Path, error: type[Exception]) -> str:
     """
     try:
         return decode_text(path.read_bytes())
-    except (OSError, UnicodeDecodeError) as cause:
+    except OSError as cause:
+        raise error(f"{path}: cannot be read ({cause.strerror or cause})") from cause
+    except UnicodeDecodeError as cause:
         raise error(f"{path}: cannot be read as text ({cause})") from cause
 
 
