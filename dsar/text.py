@@ -15,6 +15,8 @@ def read_text(path: Path, error: type[Exception]) -> str:
     """
     try:
         return decode_text(path.read_bytes())
+    except FileNotFoundError as cause:
+        raise error(f"{path}: expected a file, found no such file") from cause
     except OSError as cause:
         raise error(f"{path}: cannot be read ({cause.strerror or cause})") from cause
     except UnicodeDecodeError as cause:
