@@ -189,7 +189,7 @@ def test_what_is_no_camera_file_is_refused(tmp_path, contents):
     path = tmp_path / "cameras.json"
     if contents is not None:
         path.write_bytes(contents)
-    with pytest.raises(ConfigError, match=r"cameras\.json: expected"):
+    with pytest.raises(ConfigError, match=r"cameras\.json: (expected|cannot be read as JSON)"):
         read_cameras_json(path)
 
 
