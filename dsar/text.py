@@ -17,7 +17,9 @@ def read_text(path: Path, error: type[Exception]) -> str:
         return decode_text(path.read_bytes())
     except FileNotFoundError as cause:
         raise error(f"{path}: expected a file, found no such file") from cause
-    except (OSError, UnicodeDecodeError) as cause:
+    except OSError as cause:
+        raise error(f"{path}: cannot be read ({cause.strerror or cause})") from cause
+    except UnicodeDecodeError as cause:
         raise error(f"{path}: expected text, found what cannot be read as text ({cause})") from cause
 
 

@@ -68,6 +68,12 @@ class Drive(OnRun):
 
         return None if self.frames is None else parse_frames(self.frames)
 
+    def check_name(self, name: str) -> None:
+        """Raise ConfigError where files called so would leave the folder they are to be in, or be hidden."""
+        from dsar.data.folders import check_name
+
+        check_name("--name", name, ConfigError)
+
     def motion_file(self) -> Path | None:
         """Return the file that --motion names; None where it is to be a sequence or split of the capture."""
         path = Path(self.motion)

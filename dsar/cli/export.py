@@ -67,6 +67,7 @@ class Export(Drive):
                 "dsar export: nothing to write; give --usd out.usda, --ply DIR, --compressed-ply DIR, "
                 "--spz DIR, --glb FILE or --check FILE"
             )
+        self.check_name(self.name)
         wanted = self.wanted_frames()
         performance = self.open()
         sequence = performance.roll_out(wanted)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Literal
 
 from dsar.cli.drive import Drive, Performance
 from dsar.cli.expect import check_inputs, to_flag
+from dsar.config import EMBEDDED
 from dsar.console import follow
 from dsar.errors import CheckpointError, ConfigError
 from dsar.geometry.camera_files import cameras_to_json, list_cameras_json, read_cameras_json
@@ -104,6 +105,11 @@ class Render(Drive):
 
         if self.exr is None and self.png is None and self.mp4 is None:
             raise ConfigError("dsar render: nothing to write; give --exr DIR, --png DIR or --mp4 FILE")
+        self.check_name(self.name)
+        if self.res is not None and min(self.res) < 1:
+            raise ConfigError(
+                f"--res {self.res[0]} {self.res[1]}: expected width and height in pixels, at least 1 each"
+            )
         # With more threads sums are added in another order, and bytes would depend on the number of cores.
         torch.set_num_threads(1)
         wanted = self.wanted_frames()
@@ -271,13 +277,14 @@ class Render(Drive):
     def write_template(self, path: Path, performance: Performance, frames: Sequence[int]) -> None:
         """Write the farm's job."""
         from dsar.drafts import write_whole
-        from dsar.training.checkpoint import Run
+        from dsar.training.checkpoint import Run, read_config
         from dsar_render import openjd_template
 
         if self.mp4 is not None:
             raise ConfigError("--mp4: a farm's task has some frames, a video all of them; leave --mp4 out")
         run = Run(self.chosen_run())
-        if not run.scene.exists() and not (self.motion_file() and self.cameras):
+        kept = run.scene.exists() or read_config(run).capture == EMBEDDED
+        if not kept and not (self.motion_file() and self.cameras):
             LOGGER.warning(
                 "Run %s is older and keeps no cameras and motions: the farm's machines need its capture",
                 run.folder,

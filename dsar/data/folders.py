@@ -44,11 +44,11 @@ def inside(where: str, root: Path, name: str) -> Path:
     return Finder(root).find(root / path) or root / path
 
 
-def check_name(where: str, name: str) -> str:
-    """Return a name that is to be part of paths, or raise CaptureError where it would leave its folder."""
+def check_name(where: str, name: str, error: type[Exception] = CaptureError) -> str:
+    """Return a name that is to be part of paths, or raise `error` where it would leave its folder."""
     wrong = not name.strip(" .") or name.startswith(".") or name != name.strip()
     if wrong or any(sign in '/\\:*?"<>|' or not sign.isprintable() for sign in name):
-        raise CaptureError(
+        raise error(
             f"{where}: expected a name that can be a file's, found {name!r}; use letters, digits, _ and -"
         )
     return name

@@ -34,7 +34,9 @@ _HINTS = dict.fromkeys(
 LOGGER = logging.getLogger(__name__)
 
 
-def read_motion(path: Path, body: Body, *, up: Up | None = None, fps: float | None = None) -> Motion:
+def read_motion(
+    path: Path, body: Body, *, up: Up | None = None, fps: float | None = None, level: int = logging.INFO
+) -> Motion:
     """Return the motion of a file in the Y-up world, float32, and log what the file was taken for.
 
     Joints that the file lacks stay at rest.
@@ -45,6 +47,7 @@ def read_motion(path: Path, body: Body, *, up: Up | None = None, fps: float | No
         body: the body that will move: turning the world turns it about its pelvis.
         up: which axis is up in the file; None: found from the motion.
         fps: the file's frames per second, where it says none or a wrong one.
+        level: at which it is logged what a .npz was taken for; a warning where that is doubtful.
 
     Raises:
         MotionError: the file is missing, unreadable, incomplete, empty, not finite or no person's.
@@ -63,8 +66,7 @@ def read_motion(path: Path, body: Body, *, up: Up | None = None, fps: float | No
     rotations, translations = read_poses(path, arrays)
     told = Motion(rotations, translations, fps or read_rate(path, arrays), path.stem)
     found = _up(up) or find_up(joint_places(body, told), "z")
-    if up is None:
-        _report(path, found, f"{told.fps:g} fps")
+    _report(path, found, f"{told.fps:g} fps", level)
     return told if found.axis == "y" else turn_motion(told, body, quarter_turn(found.axis))
 
 
@@ -116,11 +118,18 @@ def _up(told: Up | None) -> Uprightness | None:
     return Uprightness(told, "told") if told else None
 
 
-def _report(path: Path, up: Uprightness, rest: str) -> None:
+def _report(path: Path, up: Uprightness, rest: str, level: int = logging.INFO) -> None:
     """Log what a file was taken for, in one line: a warning where that is doubtful."""
-    level = logging.INFO if up.sure else logging.WARNING
     doubt = "" if up.sure else f"; if that is wrong, say --up {'z' if up.axis == 'y' else 'y'}"
-    LOGGER.log(level, "%s: %s up (%s%s), %s", path.name, up.axis.upper(), up.reason, doubt, rest)
+    LOGGER.log(
+        level if up.sure else logging.WARNING,
+        "%s: %s up (%s%s), %s",
+        path.name,
+        up.axis.upper(),
+        up.reason,
+        doubt,
+        rest,
+    )
 
 
 def write_motion(path: Path, motion: Motion, body: Body) -> None:

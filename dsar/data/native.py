@@ -137,7 +137,9 @@ def _read_betas(numbers: list[Any], where: Path) -> Float[Tensor, " s"]:
 def _read_sequence_motion(root: Path, name: str, entry: Mapping[str, Any], body: Body, fps: float) -> Motion:
     where = f"{root / RECORD_NAME}, sequence {name}"
     path = inside(where, root, _get(entry, "motion", str, where))
-    motion, frames = read_motion(path, body, up="z"), _get(entry, "frames", int, where)
+    # The format says which way is up: nothing was found that a user should know.
+    motion = read_motion(path, body, up="z", level=logging.DEBUG)
+    frames = _get(entry, "frames", int, where)
     if len(motion) != frames or not same_rate(motion.fps, fps):
         raise CaptureError(
             f"{where}: expected {frames} frames at {fps:.8g} a second, found {len(motion)} at "

@@ -198,15 +198,17 @@ def load_checkpoint(run: Run) -> tuple[Avatar, TrainConfig, dict[str, str]]:
         CheckpointError: there is no checkpoint, or one of its files is damaged, foreign or not finite.
     """
     if not run.exists:
-        raise CheckpointError(f"{_without_checkpoint(run)}; expected {run.checkpoint}/avatar.safetensors")
+        avatar = run.checkpoint / "avatar.safetensors"
+        lacking = run.checkpoint / "progress.json" if avatar.exists() else avatar
+        raise CheckpointError(f"{_without_checkpoint(run)}; expected {lacking}")
     config, progress = read_config(run), read_progress(run)
     path = run.checkpoint / "avatar.safetensors"
     with reading(path):
         content = path.read_bytes()
-        avatar = _avatar(_tensors(content), config, path)
+        made = _avatar(_tensors(content), config, path)
     name = Path(progress["folder"]).name if "folder" in progress else run.folder.resolve().name
     digest = hashlib.sha256(content).hexdigest()[:16]
-    return avatar, config, {"checkpoint": digest, "run": name, "step": str(progress["step"])}
+    return made, config, {"checkpoint": digest, "run": name, "step": str(progress["step"])}
 
 
 def _without_checkpoint(run: Run) -> str:

@@ -85,6 +85,17 @@ def test_one_export_writes_every_format_and_says_what_it_cost(trained, tmp_path)
     assert json.loads((tmp_path / "check.json").read_text())["faults"] == []
 
 
+def test_suffixes_of_outputs_may_be_in_capitals(trained, tmp_path):
+    from pxr import Usd
+
+    places = ("--usd", tmp_path / "A.USDA", "--glb", tmp_path / "A.GLB")
+    command("export", trained, *places, "--frames", "1001-1002")
+    assert Usd.Stage.Open(str(tmp_path / "A.USDA")).GetEndTimeCode() == 1002
+    assert (tmp_path / "A.payload.usdc").exists()
+    for name in ("A.USDA", "A.GLB"):
+        command("export", "--check", tmp_path / name)
+
+
 def test_a_faulty_file_is_told_and_exits_with_2(tmp_path, capsys):
     values = "point3f[] positions = [(0, 0, 0)]\nint[] protoIndices = [0, 0]"
     (tmp_path / "a.usda").write_text(f'#usda 1.0\ndef PointInstancer "a" {{\n{values}\n}}\n')

@@ -228,6 +228,10 @@ def test_what_is_no_run_is_said_to_be_what_it_is(run, tmp_path):
     ):
         with pytest.raises(CheckpointError, match=said):
             dsar.load(folder)
+    progress = (run / "checkpoint" / "progress.json").rename(tmp_path / "progress.json")
+    with pytest.raises(CheckpointError, match=r"holds no checkpoint; expected .*progress\.json"):
+        dsar.load(run)
+    shutil.move(progress, run / "checkpoint")
     shutil.move(run / "checkpoint", run / "checkpoint.old")
     with pytest.raises(CheckpointError, match=r"checkpoint\.old of a crash: rename it"):
         dsar.load(run)

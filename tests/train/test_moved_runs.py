@@ -136,6 +136,16 @@ def test_an_older_run_finds_its_relative_capture_from_any_folder(older, tmp_path
     assert contents(tmp_path / "a") == contents(tmp_path / "b") == contents(tmp_path / "c") != {}
 
 
+def test_an_older_run_of_the_embedded_capture_needs_nothing_on_a_farm(older, tmp_path, caplog):
+    job = ("render", older, "--exr", tmp_path / "exr", "--frames", "1001", "--openjd", tmp_path / "job.json")
+    command(*job)
+    assert "the farm's machines need its capture" in caplog.text
+    change(older / "config.json", capture="embedded")
+    caplog.clear()
+    command(*job)
+    assert "need its capture" not in caplog.text
+
+
 def test_an_older_run_without_its_capture_needs_it_for_nothing_that_is_given(older, tmp_path, capsys, caplog):
     capture = open_capture(older.parents[1] / "caps" / "tiny")
     write_motion(tmp_path / "m.npz", capture.motions["bend"], load_body())

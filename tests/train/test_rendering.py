@@ -271,12 +271,24 @@ def failure(capsys, *arguments) -> str:
         (("--overscan", "-1"), "--overscan"),
         (("--chunk", "0", "--openjd", "job.json"), "at least one frame per task"),
         (("--name", "a b"), "found 'a b'"),
+        (("--name", "../a"), "found '../a'"),
+        (("--name", ""), "found ''"),
+        (("--res", "0", "64"), "--res 0 64: expected width and height in pixels"),
         (("--frames", "1011"), "outside motion bend"),
     ],
 )
 def test_wrong_flags_are_told_before_any_work(trained, tmp_path, capsys, flags, said):
     assert said in failure(capsys, "render", trained, "--exr", tmp_path / "exr", *flags)
     assert not (tmp_path / "exr").exists()
+
+
+@pytest.mark.parametrize("name", ["../a", "a/b", "", ".a"])
+@pytest.mark.parametrize("what", [("render", "--png"), ("export", "--ply"), ("export", "--spz")])
+def test_no_name_leads_files_out_of_their_folder(trained, tmp_path, capsys, what, name):
+    place = tmp_path / "deep" / "out"
+    shot = (trained, what[1], place, "--frames", "1001", "--name", name)
+    assert f"--name: expected a name that can be a file's, found '{name}'" in failure(capsys, what[0], *shot)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_multipart_file_holds_all_views(trained, tmp_path):

@@ -94,10 +94,15 @@ def test_text_is_read_with_and_without_a_mark_of_its_encoding(tmp_path, encoding
 
 @pytest.mark.parametrize(
     ("content", "fault"),
-    [(b"\xff\x00\x81", "as text"), (b"{", "as JSON"), (b"[" * 100_000, "as JSON"), (None, "as text")],
+    [
+        (b"\xff\x00\x81", "cannot be read as text"),
+        (b"{", "cannot be read as JSON"),
+        (b"[" * 100_000, "cannot be read as JSON"),
+        (None, "expected a file, found no such file"),
+    ],
 )
 def test_unreadable_text_is_refused_as_the_error_that_was_asked_for(tmp_path, content, fault):
     if content is not None:
         (tmp_path / "a.json").write_bytes(content)
-    with pytest.raises(ConfigError, match=rf"a\.json: cannot be read {fault}"):
+    with pytest.raises(ConfigError, match=rf"a\.json: {fault}"):
         read_json(tmp_path / "a.json", ConfigError)

@@ -210,6 +210,12 @@ def embedded():
     return open_capture()
 
 
+def test_a_capture_whose_format_says_which_way_is_up_is_read_without_a_word(folder, caplog):
+    with caplog.at_level("INFO"):
+        open_capture(folder)
+    assert not caplog.records
+
+
 def test_embedded_capture_fits_in_the_package():
     assert sum(path.stat().st_size for path in EMBEDDED_CAPTURE.rglob("*") if path.is_file()) < 42e6
 

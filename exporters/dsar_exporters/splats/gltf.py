@@ -41,7 +41,7 @@ class GltfSnapshot:
             ExportError: The name does not end in .glb, or there are no Gaussians.
             MissingDependencyError: fourdgs is not installed.
         """
-        if self.path.suffix != ".glb":
+        if self.path.suffix.lower() != ".glb":
             raise ExportError(f"{self.path}: expected a name ending in .glb: rename the output")
         fourdgs = require("fourdgs", feature="GLB", package="fourdgs", extra="ply")
         frames = sequence.frame_numbers[:1]

@@ -210,7 +210,7 @@ class UsdAsset:
         return list(self._written)
 
     def _check(self) -> None:
-        if self.path.suffix not in _SUFFIXES:
+        if self.path.suffix.lower() not in _SUFFIXES:
             raise ExportError(
                 f"{self.path}: expected a name ending in {', '.join(_SUFFIXES)}: rename the output"
             )

@@ -51,7 +51,7 @@ class AssetWriter:
         self._sequence, self._path, self._half = sequence, path, half
         self._stage = Usd.Stage.CreateNew(str(path))
         _describe(self._stage, sequence, name)
-        if path.suffix == ".usda":
+        if path.suffix.lower() == ".usda":
             self._payload_path = payload_path(path)
             self._data = Usd.Stage.CreateNew(str(self._payload_path))
             _describe(self._data, sequence, None)
