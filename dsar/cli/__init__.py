@@ -74,8 +74,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     where the command was interrupted, 143 where it was terminated.
     """
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
-    command = parse(sys.argv[1:] if arguments is None else arguments)
     try:
+        command = parse(sys.argv[1:] if arguments is None else arguments)
         with _cleaning_up_when_terminated():
             command.check_places()
             _run(command)
@@ -86,6 +86,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         # Whoever read our output has seen enough; Python would complain again when it closes it.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(_NO_READER) from None
+    except KeyboardInterrupt:
+        _leave("interrupted before any work", _INTERRUPTED)
     except OSError as error:
         what = f"{error.filename}: " if error.filename else ""
         _leave(what + explain(error), 2, error)

@@ -95,12 +95,16 @@ class Train(Common):
 
     def run(self) -> None:
         """Train, then leave pictures and a report."""
+        from dsar.data.capture import capture_of
+        from dsar.evaluation.check import refuse_at_a_glance
         from dsar.training.checkpoint import Run, read_progress
         from dsar.training.loop import train
         from dsar.training.report import Report
 
         self.check_device()
-        run = Run(self.folder)
+        run, config = Run(self.folder), self.config()
+        if not run.checkpoint.exists():
+            refuse_at_a_glance(capture_of(config).with_cameras(config.cameras))
         last: list[Report] = []
         with Bar(self.progress, "train").running() as bar:
 
@@ -110,7 +114,7 @@ class Train(Common):
                 numbers = f"loss {line.loss:.4f} PSNR {line.psnr:.2f} dB"
                 bar.show(line.progress, f"{line.stage} step {line.step} {numbers}{left}")
 
-            train(self.config(), run, resume=self.resume, report=report)
+            train(config, run, resume=self.resume, report=report)
         sheet = write_previews(run.folder)
         reached = dataclasses.asdict(last[-1]) if last else read_progress(run)
         self.write_json({"run": str(run.folder), "sheet": str(sheet), **reached})

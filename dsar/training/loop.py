@@ -54,9 +54,9 @@ def train(config: TrainConfig, run: Run, *, resume: bool = False, report: Report
             TrainingError when a value stops being finite.
     """
     config.validate()
-    if run.exists and not resume:
+    if run.checkpoint.exists() and not resume:
         raise CheckpointError(f"{run.folder} holds a run already; go on with --resume, or give another --out")
-    if resume and not run.exists:
+    if resume and not run.checkpoint.exists():
         raise CheckpointError(f"{run.folder} holds no checkpoint to resume; leave --resume out")
     config = with_absolute_paths(config)
     if resume and config.body is None:

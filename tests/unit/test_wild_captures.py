@@ -10,13 +10,14 @@ import conftest
 import layouts
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageOps
 
 from dsar.body.files import EMBEDDED_BODY
 from dsar.cli import main
 from dsar.data.capture import open_capture
 from dsar.errors import BodyError, CaptureError
 from dsar.evaluation.check import content
+from dsar.evaluation.check.glance import refuse_at_a_glance
 from dsar.evaluation.check.photographs import find_misfits
 from dsar.evaluation.check.pictures import judge_colors, judge_masks
 
@@ -373,3 +374,33 @@ def test_a_camera_that_is_grey_or_dark_beside_the_others_is_named(folder, writte
     assert f"images of cam_{layouts.SERIALS[1]} are grey" in found["grey_cameras"].what
     assert f"cam_{layouts.SERIALS[3]} shows the person" in found["camera_exposure"].what
     assert not any(finding.fatal for finding in found.values())
+
+
+MASKS, PHOTOGRAPHS = "*/mask/pha/*.jpg", "22*/*.jpg"
+UNFIT = {
+    "masks_inverted": (MASKS, lambda path, image: ImageOps.invert(image.convert("L")).save(path, quality=95)),
+    "empty_masks": (MASKS, lambda path, image: Image.new("L", image.size).save(path)),
+    "full_masks": (MASKS, lambda path, image: Image.new("L", image.size, 255).save(path)),
+    "photographs_turned": (PHOTOGRAPHS, lambda path, image: image.rotate(180).save(path, quality=95)),
+}
+
+
+@pytest.mark.parametrize("name", UNFIT)
+def test_what_check_says_cannot_train_is_refused_before_training_in_its_words(folder, tmp_path, capsys, name):
+    root = folder("avatarrex")
+    spoil(root, *UNFIT[name])
+    common = ["--body", str(EMBEDDED_BODY), "--train-frames", "0-8", "--test-frames", "10-13"]
+    with pytest.raises(SystemExit) as left:
+        main(["check", str(root), *common, "--sheet", str(tmp_path / "s.png"), "--progress", "none"])
+    assert left.value.code == 2
+    assert f"CANNOT TRAIN {name}: " in capsys.readouterr().out
+    with pytest.raises(SystemExit) as left:
+        main(conftest.train_arguments(root, tmp_path / "run", *common, "--steps", "2", "--workers", "1"))
+    assert left.value.code == 2
+    assert f"cannot train: {name}: " in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_clean_captures_pass_at_a_glance(written, name):
+    refuse_at_a_glance(reopened(written, written / name, name))

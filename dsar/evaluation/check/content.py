@@ -26,6 +26,10 @@ _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 _EDGES = (0.0, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
 
 
+Place = tuple[str, int, int]
+"""Sequence, frame, and camera by its index in the capture."""
+
+
 @dataclass(frozen=True)
 class Picture:
     """What is kept of an image that was read."""
@@ -52,10 +56,10 @@ class Picture:
     """Why it cannot be read."""
 
 
-def read_pictures(capture: MultiViewCapture) -> Iterator[Picture]:
-    """Yield every image of a capture, sequence by sequence and camera by camera."""
+def read_pictures(capture: MultiViewCapture, places: Sequence[Place] | None = None) -> Iterator[Picture]:
+    """Yield images of a capture: every one, sequence by sequence and camera by camera, or those of places."""
 
-    def load(place: tuple[str, int, int]) -> Picture:
+    def load(place: Place) -> Picture:
         try:
             image = capture.image(*place)
         except CaptureError as error:
@@ -63,13 +67,17 @@ def read_pictures(capture: MultiViewCapture) -> Iterator[Picture]:
         digest = blake2b(image.tobytes(), digest_size=16).digest()
         return Picture(*place, digest, *_cover(image[..., 3]), int(image[..., 3].max()), *_describe(image))
 
+    with ThreadPoolExecutor(_THREADS) as threads:
+        yield from threads.map(load, _every_place(capture) if places is None else places)
+
+
+def _every_place(capture: MultiViewCapture) -> list[Place]:
     places = []
     for name, motion in capture.motions.items():
         seen = [capture.seen_by(name, frame) for frame in range(len(motion))]
         by_camera = sorted((index, frame) for frame, cameras in enumerate(seen) for index in cameras)
         places += [(name, frame, index) for index, frame in by_camera]
-    with ThreadPoolExecutor(_THREADS) as threads:
-        yield from threads.map(load, places)
+    return places
 
 
 def count_images(capture: MultiViewCapture) -> int:
