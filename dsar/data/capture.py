@@ -66,7 +66,8 @@ def open_capture(
     """
     root = EMBEDDED_CAPTURE if source == "embedded" else Path(source).expanduser().resolve()
     if not root.is_dir():
-        raise CaptureError(f"capture {root}: no such folder; give a capture folder or `embedded`")
+        found = "a file" if root.exists() else "nothing"
+        raise CaptureError(f"capture {root}: expected the folder of a capture, or `embedded`, found {found}")
     opening = Opening(None if body is None else Path(body), train_frames, test_frames)
     for is_format, open_format in FORMATS.values():
         if is_format(root):
