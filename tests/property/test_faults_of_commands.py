@@ -27,8 +27,8 @@ RUN = tuple(f"run/{name}" for name in STORED)
 CAPTURE = ("capture/capture.json", "capture/motion/sway.npz", "capture/images/sway/cam1/0003.png")
 STATE = (*RUN, "run/checkpoint/adam.safetensors", "run/checkpoint/rollouts-0.json", "run/metrics.jsonl")
 COMMANDS = {
-    "train": (f"train capture --out out/run --steps 3 {TRAIN}", CAPTURE, ("out/run",), 3),
-    "resume": (f"train capture --out run --resume --steps 123 {TRAIN}", STATE, ("run",), 5),
+    "train": (f"train capture --out out/run --steps 3 {TRAIN}", CAPTURE, ("out/run",), 2),
+    "resume": (f"train capture --out run --resume --steps 123 {TRAIN}", STATE, ("run",), 3),
     "check": ("check capture --sheet out/sheet.png", CAPTURE, ("out/sheet.png",), 4),
     "stage": (
         f"export run --motion walk.npz --usd out/a.usda --clips {FRAMES}",
@@ -55,7 +55,7 @@ COMMANDS = {
         6,
     ),
     "job": (f"render run --exr out/exr --openjd out/job.json {FRAMES}", RUN, ("out/job.json",), 5),
-    "eval": ("eval run --json out/eval.json", (*RUN, *CAPTURE), ("out/eval.json",), 3),
+    "eval": ("eval run --json out/eval.json", (*RUN, *CAPTURE), ("out/eval.json",), 2),
     "stress": ("stress run --json out/stress.json", STATE, ("out/stress.json",), 4),
     "look": ("export --check in/avatar.1001.ply --json out/j", ("in/avatar.1001.ply",), ("out/j",), 5),
     "look at a stage": ("export --check in/a.usda", ("in/a.usda", "in/a.payload.usdc"), (), 4),

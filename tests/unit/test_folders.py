@@ -95,9 +95,9 @@ def test_text_is_read_with_and_without_a_mark_of_its_encoding(tmp_path, encoding
 @pytest.mark.parametrize(
     ("content", "fault"),
     [
-        (b"\xff\x00\x81", "cannot be read as text"),
-        (b"{", "cannot be read as JSON"),
-        (b"[" * 100_000, "cannot be read as JSON"),
+        (b"\xff\x00\x81", "expected text, found what cannot be read as text"),
+        (b"{", "expected JSON, found what cannot be read as JSON"),
+        (b"[" * 100_000, "expected JSON, found what cannot be read as JSON"),
         (None, "expected a file, found no such file"),
     ],
 )

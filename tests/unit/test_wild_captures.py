@@ -376,12 +376,15 @@ def test_a_camera_that_is_grey_or_dark_beside_the_others_is_named(folder, writte
     assert not any(finding.fatal for finding in found.values())
 
 
-MASKS, PHOTOGRAPHS = "*/mask/pha/*.jpg", "22*/*.jpg"
+MASK_FILES, PHOTOGRAPH_FILES = "*/mask/pha/*.jpg", "22*/*.jpg"
 UNFIT = {
-    "masks_inverted": (MASKS, lambda path, image: ImageOps.invert(image.convert("L")).save(path, quality=95)),
-    "empty_masks": (MASKS, lambda path, image: Image.new("L", image.size).save(path)),
-    "full_masks": (MASKS, lambda path, image: Image.new("L", image.size, 255).save(path)),
-    "photographs_turned": (PHOTOGRAPHS, lambda path, image: image.rotate(180).save(path, quality=95)),
+    "masks_inverted": (
+        MASK_FILES,
+        lambda path, image: ImageOps.invert(image.convert("L")).save(path, quality=95),
+    ),
+    "empty_masks": (MASK_FILES, lambda path, image: Image.new("L", image.size).save(path)),
+    "full_masks": (MASK_FILES, lambda path, image: Image.new("L", image.size, 255).save(path)),
+    "photographs_turned": (PHOTOGRAPH_FILES, lambda path, image: image.rotate(180).save(path, quality=95)),
 }
 
 
