@@ -14,7 +14,7 @@ demo: $(STAMP)
 
 # Two files at a time: half of the suite waits for processes that it starts.
 test: $(STAMP)
-	$(BIN)/pytest -n 2 --dist loadfile
+	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 # Blender, a splat converter and a web viewer of others, in which our files are tried; about 1.3 GB.
 interop: $(STAMP)

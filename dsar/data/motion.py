@@ -54,9 +54,8 @@ def read_motion(
     """
     if fps is not None and not 0 < fps < float("inf"):
         raise MotionError(f"motion file {path}: --motion-fps {fps:g}, expected frames per second above 0")
-    if not path.is_file():
-        found = "a folder" if path.is_dir() else "no such file"
-        raise MotionError(f"motion file {path}: expected a file, found {found}")
+    if path.is_dir():
+        raise MotionError(f"motion file {path}: expected a file, found a folder")
     kind = path.suffix.lower()
     if kind == ".bvh":
         return _read_bvh(path, body, up, fps)

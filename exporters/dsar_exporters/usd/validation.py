@@ -105,7 +105,10 @@ def _validator_errors(stage: Usd.Stage, *, whole: bool) -> Iterator[str]:
     try:
         errors = UsdValidation.ValidationContext(validators).Validate(stage)
     except Tf.ErrorException as error:
-        yield f"expected files that USD can open, found one that it depends on broken: {reason(error)}"
+        # Validators run beside each other, and which error comes first is chance; the stage names the file.
+        said = [str(each) for each in stage.GetCompositionErrors()] or [reason(error)]
+        what = "expected files that USD can open, found one that it depends on broken"
+        yield from (f"{what}: {' '.join(each.split())}" for each in said)
         return
     for error in errors:
         yield f"{error.GetName()}: {error.GetMessage()}"
