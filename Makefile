@@ -12,7 +12,7 @@ demo: $(STAMP)
 	$(BIN)/dsar export $(RUN) --usd $(RUN)/out.usda --ply $(RUN)/ply
 	$(BIN)/dsar render $(RUN) --exr $(RUN)/exr --mp4 $(RUN)/out.mp4
 
-# Two files at a time: half of the suite waits for processes that it starts.
+# Two files of tests at a time, the slow ones (tests/train) before the quick.
 test: $(STAMP)
 	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder
 
