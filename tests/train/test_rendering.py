@@ -1,5 +1,6 @@
 """`dsar render`: the same files whoever draws them, and whatever happens on the way."""
 
+import contextlib
 import json
 import os
 import random
@@ -31,20 +32,35 @@ def render(run, folder, *more, shot=SHOT):
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """Return all files of a folder, hidden ones too."""
+    """Return all files of a folder that nobody writes to any more, hidden ones too."""
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def spawned(run, folder, *more) -> subprocess.Popen:
+def images(folder: Path) -> list[Path]:
+    """Return the finished images, also while others are being written.
+
+    Drafts are hidden folders that come and go; a search that enters them may find one gone.
+    """
+    return list(folder.glob("*/[!.]*.exr"))
+
+
+@contextlib.contextmanager
+def spawned(run, folder, *more):
+    """Run a render in a process of its own, which does not outlive the block."""
     arguments = [sys.executable, "-m", "dsar", "render", run, "--exr", folder, *SHOT, *more]
     paths = {"PYTHONPATH": os.pathsep.join(sys.path)}
-    return subprocess.Popen(
+    process = subprocess.Popen(
         [*map(str, arguments), "--progress", "none"], env=os.environ | paths, stderr=subprocess.PIPE
     )
+    with process:
+        try:
+            yield process
+        finally:
+            process.kill()
 
 
 def wait_for_images(folder: Path, count: int, process: subprocess.Popen) -> None:
-    while len(list(folder.rglob("*.exr"))) < count:
+    while len(images(folder)) < count:
         assert process.poll() is None, "the run ended before it could be disturbed"
         time.sleep(0.01)
 
@@ -74,10 +90,10 @@ def test_a_cluster_writes_the_same_bytes_as_one_process(trained, whole, tmp_path
 
 
 def test_two_processes_of_which_one_is_killed_write_the_same_bytes_as_one(trained, whole, tmp_path):
-    process = spawned(trained, tmp_path, "--jobs", 2)
-    wait_for_images(tmp_path, 3, process)
-    os.kill(children(process.pid)[0], signal.SIGKILL)
-    _, log = process.communicate(timeout=120)
+    with spawned(trained, tmp_path, "--jobs", 2) as process:
+        wait_for_images(tmp_path, 3, process)
+        os.kill(children(process.pid)[0], signal.SIGKILL)
+        _, log = process.communicate(timeout=120)
     assert process.returncode == 0, log
     assert contents(tmp_path) == whole
 
@@ -85,12 +101,12 @@ def test_two_processes_of_which_one_is_killed_write_the_same_bytes_as_one(traine
 def test_a_run_that_is_killed_again_and_again_goes_on_to_the_same_bytes(trained, whole, tmp_path):
     chance = random.Random(7)
     for attempt in range(3):
-        process = spawned(trained, tmp_path, "--jobs", 1 + attempt % 2, "--skip-existing")
-        wait_for_images(tmp_path, 8 * attempt + chance.randint(1, 6), process)
-        time.sleep(chance.random() * 0.1)
-        process.kill()
-        process.communicate()
-        there = {name: data for name, data in contents(tmp_path).items() if name.endswith(".exr")}
+        with spawned(trained, tmp_path, "--jobs", 1 + attempt % 2, "--skip-existing") as process:
+            wait_for_images(tmp_path, 8 * attempt + chance.randint(1, 6), process)
+            time.sleep(chance.random() * 0.1)
+            process.kill()
+            process.communicate()
+        there = {str(path.relative_to(tmp_path)): path.read_bytes() for path in images(tmp_path)}
         assert there == {name: whole[name] for name in there}
     # What workers that outlive their parent for a moment have in hand.
     time.sleep(1)
@@ -99,10 +115,10 @@ def test_a_run_that_is_killed_again_and_again_goes_on_to_the_same_bytes(trained,
 
 
 def test_sigterm_ends_a_run_with_143_and_nothing_half_done(trained, whole, tmp_path):
-    process = spawned(trained, tmp_path, "--jobs", 2)
-    wait_for_images(tmp_path, 2, process)
-    process.terminate()
-    process.communicate(timeout=60)
+    with spawned(trained, tmp_path, "--jobs", 2) as process:
+        wait_for_images(tmp_path, 2, process)
+        process.terminate()
+        process.communicate(timeout=60)
     assert process.returncode == 143
     found = contents(tmp_path)
     assert 0 < len(found) < len(whole)
@@ -113,7 +129,7 @@ def test_only_what_is_missing_or_broken_or_of_another_job_is_rendered(trained, w
     shot = ("--frames", "1003-1005", *SHOT[2:])
     wanted = {name: data for name, data in whole.items() if name[-8:-4] in ("1003", "1004", "1005")}
 
-    def images(*more) -> tuple[int, int]:
+    def rendered(*more) -> tuple[int, int]:
         flags = ("--skip-existing", "--json", tmp_path / "j")
         render(trained, tmp_path / "exr", *flags, *more, shot=shot)
         facts = json.loads((tmp_path / "j").read_text())
@@ -123,14 +139,14 @@ def test_only_what_is_missing_or_broken_or_of_another_job_is_rendered(trained, w
         path = tmp_path / "exr" / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(data)
-    assert images() == (0, 6)
+    assert rendered() == (0, 6)
     broken = tmp_path / "exr" / "cam0" / "avatar.cam0.1003.exr"
     broken.write_bytes(broken.read_bytes()[:-100])
     (tmp_path / "exr" / "cam0" / "avatar_deep.cam0.1005.exr").unlink()
-    assert images() == (4, 2)
+    assert rendered() == (4, 2)
     assert contents(tmp_path / "exr") == wanted
-    assert images("--colorspace", "ACEScg") == (6, 0)
-    assert images("--colorspace", "ACEScg") == (0, 6)
+    assert rendered("--colorspace", "ACEScg") == (6, 0)
+    assert rendered("--colorspace", "ACEScg") == (0, 6)
 
 
 def test_frames_asked_for_alone_are_those_of_the_whole(trained, whole, tmp_path):
