@@ -1,7 +1,9 @@
 """What the documents say of files, functions, settings, flags and equations is there."""
 
 import ast
+import contextlib
 import dataclasses
+import io
 import re
 from functools import cache
 from pathlib import Path
@@ -13,10 +15,7 @@ from dsar.config import TrainConfig
 
 ROOT = Path(__file__).parents[2]
 LOG = ROOT / "docs" / "log"
-PAGES = sorted(
-    [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *ROOT.glob("docs/**/*.md")]
-    + [ROOT / "benchmarks" / "results" / "README.md"]
-)
+PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("benchmarks/**/README.md")])
 LIVING = [page for page in PAGES if page.parent != LOG and page.name != "CHANGELOG.md"]
 """Pages that speak of the code as it is; log and changelog keep the names of their day."""
 PACKAGES = {"dsar": ROOT, "dsar_exporters": ROOT / "exporters", "dsar_render": ROOT / "render"}
@@ -25,6 +24,21 @@ ROOMS = [ROOT, ROOT / "dsar", *PACKAGES.values()]
 FENCE = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
 CODE = re.compile(r"`([^`\n]+)`")
 SOURCE = re.compile(r"(?:[\w.-]+/)+[\w.-]+\.(?:py|mjs|md|json|svg|png|jpg|sh)|(?:[a-z_]+/)+|[a-z_]+\.py")
+USERS = {
+    "4x",
+    "Capture",
+    "SERIAL",
+    "checkpoint",
+    "exr",
+    "garment",
+    "images",
+    "masks",
+    "motion",
+    "name",
+    "ply",
+}
+USERS |= {"previews", "runs"}
+"""First folders of paths in runs and captures, which are the user's."""
 COMMANDS = ("check", "train", "export", "render", "eval", "stress", "crosscheck")
 
 
@@ -62,24 +76,7 @@ def test_every_relative_link_resolves(page):
 def paths_in(text):
     """Return the files and folders of ours that a text names as code."""
     spans = CODE.findall(text)
-    return [span for span in spans if SOURCE.fullmatch(span) and span.split("/")[0] not in FOREIGN]
-
-
-FOREIGN = {
-    "runs",
-    "previews",
-    "checkpoint",
-    "ply",
-    "exr",
-    "motion",
-    "images",
-    "masks",
-    "garment",
-    "name",
-    "Capture",
-    "4x",
-}
-"""First folders of paths in runs and captures, which are the user's and not ours."""
+    return [span for span in spans if SOURCE.fullmatch(span) and span.split("/")[0] not in USERS]
 
 
 @pytest.mark.parametrize("page", LIVING, ids=named)
@@ -94,7 +91,7 @@ def test_every_file_that_is_named_exists(page):
 
 @cache
 def definitions(file):
-    """Return the names that a module defines: `function`, `Class`, `Class.method`, `Class.field`, `CONSTANT`."""
+    """Return the names that a module defines: functions, classes, constants, `Class.method`, `Class.field`."""
     found = set()
 
     def visit(body, prefix):
@@ -173,9 +170,6 @@ def test_every_setting_that_is_named_exists(page):
 @cache
 def flags_of(command):
     """Return the flags in a command's help."""
-    import contextlib
-    import io
-
     text = io.StringIO()
     with contextlib.redirect_stdout(text), pytest.raises(SystemExit):
         main([command, "--help"])
