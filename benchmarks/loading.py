@@ -24,12 +24,12 @@ from results import write_json
 from dsar.avatar.avatar import Avatar
 from dsar.body.files import EMBEDDED_BODY
 from dsar.config import PRESETS
-from dsar.data import images
-from dsar.data.capture import open_capture
-from dsar.data.multiview import MultiViewCapture
+from dsar.data.captures.formats import open_capture
+from dsar.data.captures.multiview import MultiViewCapture
+from dsar.data.images import decoding
+from dsar.training.chunk import ChunkTrainer
 from dsar.training.loop import training_clips
-from dsar.training.segment import SegmentTrainer
-from dsar.training.stages import position
+from dsar.training.schedule import schedule_at
 from dsar.training.targets import Target, TargetLoader, load_target
 
 SEQUENCE, SCALE = "sway", 8
@@ -41,7 +41,7 @@ LATE = 0.9
 class AtOnce(TargetLoader):
     """Loads a view when it is asked for, in the caller's thread."""
 
-    def ask(self, rng, sequence, frame, reduction, count):
+    def request(self, rng, sequence, frame, reduction, count):
         """Load views and return them."""
         return [
             _done(load_target(self.capture, sequence, frame, int(k), reduction))
@@ -54,9 +54,9 @@ class Timed(TargetLoader):
 
     waited = 0.0
 
-    def ask(self, rng, sequence, frame, reduction, count):
+    def request(self, rng, sequence, frame, reduction, count):
         """Begin to load; the caller's wait is counted when it asks for a result."""
-        return [_Waiting(self, each) for each in super().ask(rng, sequence, frame, reduction, count)]
+        return [_Waiting(self, each) for each in super().request(rng, sequence, frame, reduction, count)]
 
 
 class _Waiting(Future):
@@ -74,7 +74,7 @@ class _Waiting(Future):
 def _draw(
     loader: TargetLoader, rng: np.random.Generator, sequence: str, frame: int, count: int
 ) -> np.ndarray:
-    seen = loader.capture.seen_by(sequence, frame)
+    seen = loader.capture.cameras_with_image(sequence, frame)
     return rng.choice(seen, min(count, len(seen)), replace=False)
 
 
@@ -126,8 +126,8 @@ def measure(capture: MultiViewCapture, updates: int) -> dict:
     config = PRESETS["demo"]
     config = dataclasses.replace(config, atlas=dataclasses.replace(config.atlas, garment="off"))
     avatar = Avatar.from_capture(capture, capture.body, config.atlas, config.model)
-    trainer = SegmentTrainer(config, capture, avatar.train(), training_clips(capture), None)
-    now, ahead = position(config.schedule, LATE), Timed(capture)
+    trainer = ChunkTrainer(config, capture, avatar.train(), training_clips(capture), None)
+    now, ahead = schedule_at(config.schedule, LATE), Timed(capture)
     seconds: dict[str, list[float]] = {"at_once": [], "ahead": []}
     for update in range(-2, updates):
         for name, loader in (("at_once", AtOnce(capture)), ("ahead", ahead)):
@@ -135,7 +135,7 @@ def measure(capture: MultiViewCapture, updates: int) -> dict:
             rng = np.random.default_rng(update + 2)
             avatar.zero_grad()
             began = time.perf_counter()
-            trainer.segment(rng, now)
+            trainer.backward_chunk(rng, now)
             if update >= 0:
                 seconds[name].append(time.perf_counter() - began)
             elif name == "ahead":
@@ -151,7 +151,7 @@ def measure(capture: MultiViewCapture, updates: int) -> dict:
         "waiting_share": ahead.waited / sum(seconds["ahead"]),
         "load_ms": 1e3 * (time.perf_counter() - began) / len(views),
         "reduction": now.reduction,
-        "kept_bytes": images.CACHE.used,
+        "kept_bytes": decoding.CACHE.used,
     }
 
 
@@ -164,7 +164,7 @@ def main() -> None:
     torch.set_num_threads(1)
     frames, cameras, updates = (8, 2, 3) if arguments.quick else (24, 4, 12)
     # So that every view is read: what a capture larger than memory comes to.
-    images.CACHE.room = 0
+    decoding.CACHE.capacity = 0
     with tempfile.TemporaryDirectory() as folder:
         write_large(Path(folder) / "take", frames, cameras)
         ranges = {"train_frames": f"0-{frames - 3}", "test_frames": f"{frames - 2}-{frames - 1}"}

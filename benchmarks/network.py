@@ -36,10 +36,10 @@ from torch.utils.flop_counter import FlopCounterMode
 from dsar.avatar.avatar import Avatar
 from dsar.body.atlas import Atlas
 from dsar.config import PRESETS, ModelConfig
-from dsar.data.capture import open_capture
-from dsar.evaluation.parts import count_parts, read_clock, time_parts
+from dsar.data.captures.formats import open_capture
+from dsar.evaluation.profiling import count_stage_flops, read_clock, time_stages
 from dsar.network import DualStreamNetwork, NetworkOutput
-from dsar.network.streaming import Rollout
+from dsar.network.session import InferenceSession
 from dsar.raster import rasterize
 from dsar.types import Motion, RenderOutput
 
@@ -108,7 +108,7 @@ def build(case: Case, design: str, device: str) -> Subject:
     atlas, motion = find_atlas(case.preset)
     config = case.config("shared" if design == LITERAL else design)
     avatar = Avatar(open_capture().body, atlas, config, motion.fps)
-    track = avatar.track(motion).to(device)
+    signal = avatar.driving_signal(motion).to(device)
     network = avatar.to(device).network
     torch.nn.init.normal_(network.decoder.head.weight, std=0.01)
     drawn = _draw(config, case, avatar.grid_size, device)
@@ -116,7 +116,7 @@ def build(case: Case, design: str, device: str) -> Subject:
         literal = LiteralNetwork(network).to(device)
         rollout, training = LiteralRollout(literal), partial(_train_literal, literal, *drawn)
     else:
-        rollout = Rollout(network, precision=torch.bfloat16 if device == "cuda" else None)
+        rollout = InferenceSession(network, precision=torch.bfloat16 if device == "cuda" else None)
         network, training = rollout.network, partial(_train, network, *drawn)
     maps, magnitude = (x[-1, :1] for x in drawn)
 
@@ -124,12 +124,12 @@ def build(case: Case, design: str, device: str) -> Subject:
     def step() -> NetworkOutput:
         return rollout.step(maps, magnitude)
 
-    context, camera = track[[70]], make_camera(*case.image)
+    motion_window, camera = signal[[70]], make_camera(*case.image)
 
     @torch.no_grad()
     def frame() -> RenderOutput:
-        output = rollout.step(*avatar.standardized(avatar.maps(context, avatar.fps)))
-        return rasterize(avatar.gaussians(context, output)[0], camera)
+        output = rollout.step(*avatar.standardize(avatar.input_maps(motion_window, avatar.fps)))
+        return rasterize(avatar.gaussians(motion_window, output)[0], camera)
 
     # The first frame fills the window.
     step()
@@ -147,7 +147,7 @@ def _draw(
 
 def _train(network: DualStreamNetwork, maps: Tensor, magnitudes: Tensor) -> None:
     """Back-propagate one step, from a state that was carried on."""
-    state = network.start(maps.shape[1])
+    state = network.initial_state(maps.shape[1])
     state = dataclasses.replace(state, fresh=torch.zeros_like(state.fresh))
     output, _ = network(maps[-1], magnitudes[-1], state)
     _backward(network, output)
@@ -155,7 +155,7 @@ def _train(network: DualStreamNetwork, maps: Tensor, magnitudes: Tensor) -> None
 
 def _train_literal(literal: LiteralNetwork, maps: Tensor, magnitudes: Tensor) -> None:
     config, batch = literal.network.config, maps.shape[1]
-    state = literal.network.start(batch)
+    state = literal.network.initial_state(batch)
     offsets = [state.offsets.flatten(1, 2)] * config.window
     output, _ = literal(list(maps), list(magnitudes), offsets, list(state.memory.unbind(1)))
     _backward(literal, output)
@@ -198,7 +198,7 @@ def _take_apart(subject: Subject, name: str, batch: int, *, whole: bool) -> dict
         with FlopCounterMode(display=False) as counter:
             getattr(subject, name)()
         return {"gflop": {"total": 1e-9 * counter.get_total_flops() / batch}}
-    return {"gflop": count_parts(subject.network, subject.rollout), "parts_ms": _parts(subject)}
+    return {"gflop": count_stage_flops(subject.network, subject.rollout), "parts_ms": _parts(subject)}
 
 
 def _per_rollout(timing: Timing, batch: int) -> dict:
@@ -210,7 +210,7 @@ def _parts(subject: Subject, repeats: int = 10) -> dict[str, float]:
     """Return the median milliseconds of a rollout's frame by part."""
     found = defaultdict(list)
     for _ in range(repeats):
-        for name, milliseconds in time_parts(subject.network, subject.rollout)[1].items():
+        for name, milliseconds in time_stages(subject.network, subject.rollout)[1].items():
             found[name].append(milliseconds)
     return {name: statistics.median(values) for name, values in found.items()}
 

@@ -25,11 +25,11 @@ import numba
 import numpy as np
 import torch
 from fragments import Work, count_work
+from raster_kernels import measure_kernels
 from report import describe_arithmetic, describe_ratio, describe_rival, describe_row, describe_stages
 from results import write_json
 from rivals import NOT_COMPARED, OURS, RIVALS, Rival, Scene
 from scene import make_body, make_camera
-from stages import measure_stages
 from timing import time_once, time_runs
 
 FLOP_PER_FRAGMENT = 36
@@ -233,7 +233,7 @@ def find_stages(plan: Plan, threads: list[int], peaks: dict[int, float]) -> list
     for size in plan.sizes:
         for count in threads:
             use_threads(count)
-            stages = measure_stages(make_body(size[0]), make_camera(*size[1:]), plan.stage_repeats)
+            stages = measure_kernels(make_body(size[0]), make_camera(*size[1:]), plan.stage_repeats)
             case = dict(zip(("gaussians", "width", "height"), size, strict=True)) | {"threads": count}
             share = {name: rate / peaks[count] for name, rate in stages.gflops.items()}
             found.append(case | asdict(stages) | {"share_of_peak": share})

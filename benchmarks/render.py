@@ -21,13 +21,13 @@ from machine import describe_machine, read_load
 from results import write_json
 
 from dsar.avatar import roll_out
-from dsar.data.capture import capture_of
-from dsar.geometry.paths import CameraPath
+from dsar.data.captures.formats import capture_of
+from dsar.geometry.camera_paths import CameraPath
 from dsar.raster import rasterize
 from dsar.training.checkpoint import Run, load_checkpoint
 from dsar.types import Camera, GaussianSequence
 from dsar_exporters import ExrSequence
-from dsar_render import RenderSettings, Shot, iterate_instants, labels_of, render_shot, take_picture
+from dsar_render import RenderSettings, Shot, iterate_triplets, label_sequence, render_picture, render_shot
 from dsar_render.aovs import Aov
 
 _ROUNDS = 3
@@ -43,19 +43,19 @@ def time_stages(sequence: GaussianSequence, path: CameraPath, layers: tuple[Aov,
     writer, settings, labels = (
         ExrSequence(folder, layers=layers),
         RenderSettings(aovs=layers),
-        labels_of(sequence),
+        label_sequence(sequence),
     )
     stages: dict[str, list[float]] = {name: [] for name in ("rollout", "raster", "aovs", "color", "encode")}
-    instants = iterate_instants(sequence, list(sequence.frame_numbers))
+    triplets = iterate_triplets(sequence, list(sequence.frame_numbers))
     while True:
         marks = [time.perf_counter()]
-        instant = next(instants, None)
-        if instant is None:
+        triplet = next(triplets, None)
+        if triplet is None:
             break
         marks.append(time.perf_counter())
-        rasterize(instant.now, path.at(instant.frame))
+        rasterize(triplet.now, path.at(triplet.frame))
         marks.append(time.perf_counter())
-        picture = take_picture(instant, path, settings, labels=labels, fps=sequence.fps)
+        picture = render_picture(triplet, path, settings, labels=labels, fps=sequence.fps)
         marks.append(time.perf_counter())
         writer.target.premultiplied(picture.output.color.numpy(), picture.output.alpha.numpy())
         marks.append(time.perf_counter())
@@ -79,12 +79,12 @@ def run_plain(
         (ExrSequence(folder, layers=layers),),
         RenderSettings(aovs=layers),
     )
-    labels = labels_of(sequence)
+    labels = label_sequence(sequence)
     ends = []
     frames, neighbours = list(sequence.frame_numbers), shot.settings.needs_neighbours
-    for instant in iterate_instants(sequence, frames, neighbours=neighbours):
+    for triplet in iterate_triplets(sequence, frames, neighbours=neighbours):
         for path in shot.paths:
-            picture = take_picture(instant, path, shot.settings, labels=labels, fps=sequence.fps)
+            picture = render_picture(triplet, path, shot.settings, labels=labels, fps=sequence.fps)
             shot.writers[0].write([picture], [""])
         ends.append(time.perf_counter())
     return _rate(ends, len(cameras))

@@ -17,11 +17,11 @@ from results import write_json
 
 from dsar.avatar.avatar import Avatar
 from dsar.avatar.rollout import START_FRAME, network_outputs, roll_out
-from dsar.data.capture import capture_of
-from dsar.data.multiview import MultiViewCapture
+from dsar.data.captures.formats import capture_of
+from dsar.data.captures.multiview import MultiViewCapture
 from dsar.evaluation.heldout import compare, evaluate_sequence, one_to_many
-from dsar.evaluation.horizon import looped
-from dsar.evaluation.settling import rms_speeds, settle_time
+from dsar.evaluation.looping import loop_motion
+from dsar.evaluation.settling import rms_speeds, settling_time
 from dsar.evaluation.views import render_white, true_view
 from dsar.training.checkpoint import Run, load_checkpoint
 
@@ -46,21 +46,21 @@ def measure_streams(avatar: Avatar, capture: MultiViewCapture, stride: int) -> d
 
 def measure_settling(avatar: Avatar, capture: MultiViewCapture) -> dict:
     """Return how long the garment moves after the stop, seconds: the true one and each variant's."""
-    pair, garment = capture.one_to_many[0], avatar.garment_points()
+    pair, garment = capture.one_to_many[0], avatar.garment_control_points()
     motion, (start, end) = capture.motions[pair.sequence], pair.after_stop
     true = rms_speeds(torch.from_numpy(capture.garment(pair.sequence)), motion.fps)
     slow = SLOW * float(true[start])
     found = {"stretch": (end - start) / motion.fps, "slow": slow}
-    found["true"] = settle_time(true, start, end, slow, motion.fps)
+    found["true"] = settling_time(true, start, end, slow, motion.fps)
     for name, streams in VARIANTS.items():
         points = torch.cat(
             [
-                avatar.deformed_control_points(context, output)[:, garment]
-                for context, output in network_outputs(avatar, motion, streams=streams)
+                avatar.deformed_control_points(motion_window, output)[:, garment]
+                for motion_window, output in network_outputs(avatar, motion, streams=streams)
             ]
         )
         speeds = rms_speeds(points.detach(), motion.fps)
-        found[name] = settle_time(speeds, start, end, slow, motion.fps)
+        found[name] = settling_time(speeds, start, end, slow, motion.fps)
         found[f"{name}.speeds"] = [round(float(speed), 3) for speed in speeds[start:end:4]]
     found["true.speeds"] = [round(float(speed), 3) for speed in true[start:end:4]]
     return found
@@ -73,9 +73,9 @@ def measure_horizon(
     sequence = capture.splits["fd"][0] if capture.splits.get("fd") else capture.splits["test"][0]
     motion = capture.motions[sequence]
     clip = statistics.fmean(len(capture.motions[name]) for name in capture.splits["train"])
-    _, period = looped(motion, 1)
+    _, period = loop_motion(motion, 1)
     rounds = {horizon: int(horizon * clip) // period for horizon in horizons}
-    long, _ = looped(motion, max(rounds.values()) + 1)
+    long, _ = loop_motion(motion, max(rounds.values()) + 1)
     chosen = {
         START_FRAME + period * index + frame: frame
         for index in set(rounds.values())
@@ -105,7 +105,9 @@ def main() -> None:
     capture = capture_of(config)
     stride, horizons = (20, (1, 10)) if arguments.quick else (4, HORIZONS)
     found = {"run": str(arguments.run), **provenance, "wiring": config.model.wiring, "seed": config.seed}
-    found |= {"recall": float(avatar.network.bank.recall_logit.sigmoid()) if avatar.network.bank else None}
+    found |= {
+        "memory_weight": float(avatar.network.bank.memory_logit.sigmoid()) if avatar.network.bank else None
+    }
     found["streams"] = measure_streams(avatar, capture, stride)
     found["settling"] = measure_settling(avatar, capture)
     found["horizon"] = measure_horizon(avatar, capture, 2 * stride, horizons)

@@ -16,7 +16,7 @@ from statistics import median
 from machine import describe_machine, read_load
 from results import write_json
 
-from dsar.data.capture import capture_of
+from dsar.data.captures.formats import capture_of
 from dsar.evaluation.heldout import time_rollout
 from dsar.training.checkpoint import Run, load_checkpoint
 

@@ -11,7 +11,7 @@ from typing import Any
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 _PUBLIC = {
-    "open_capture": "dsar.data.capture",
+    "open_capture": "dsar.data.captures.formats",
     "train": "dsar.training.loop",
     "load": "dsar.training.checkpoint",
     "roll_out": "dsar.avatar.rollout",

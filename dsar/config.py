@@ -60,7 +60,7 @@ class ModelConfig:
     """Feed velocity maps."""
     acceleration: bool = True
     """Feed acceleration maps (extension; it nearly halves the error of driven cloth)."""
-    lags: tuple[float, ...] = (0.1, 0.2, 0.4)
+    mean_time_constants: tuple[float, ...] = (0.1, 0.2, 0.4)
     """Feed, for each of these times in seconds, how far a running mean of the motion lags behind it
     (extension): a memory that nothing has to learn."""
     pose_components: int = 0
@@ -79,9 +79,9 @@ class ModelConfig:
     of the work."""
     bases: int = 0
     """Fixed maps that the output is a mixture of, instead of the decoder's convolutions; 0: the decoder."""
-    identity_channels: int = 8
+    uv_feature_channels: int = 8
     """Channels of a learnt static map that tells pixels apart (extension)."""
-    recall: float = 0.5
+    memory_weight: float = 0.5
     """Initial lambda: the share of the memory in the hidden state."""
     offset_scale: float = 0.3
     """Metres of offset for a unit output."""
@@ -95,8 +95,8 @@ class ModelConfig:
 
     @property
     def map_channels(self) -> int:
-        """Channels of a frame's input maps without feedback: position, velocity, acceleration, lags."""
-        return 3 + 3 * self.velocity + 3 * self.acceleration + 3 * len(self.lags)
+        """Channels of a frame's input maps without the offsets that are fed back."""
+        return 3 + 3 * self.velocity + 3 * self.acceleration + 3 * len(self.mean_time_constants)
 
     @property
     def appearance_channels(self) -> int:
@@ -133,7 +133,7 @@ class LossConfig:
     """L_sm, accelerations in cm per frame squared."""
     temporal_scale: float = 0.001
     """Common factor of the three temporal losses, whose unit the paper does not give."""
-    still_speed: float = 0.3
+    tau: float = 0.3
     """tau_reg in m/s: the motion magnitude V at which the temporal weight has fallen to 1/e."""
     adaptive: bool = True
     """Weigh prediction and smoothness by exp(-V / tau_reg); off: by 1."""
@@ -153,42 +153,42 @@ class ScheduleConfig:
     minutes: float | None = None
     """Wall-clock budget, counted from the end of the first update (which compiles kernels on a new machine):
     the schedule is compressed to fit when the machine is too slow for `steps`."""
-    template_share: float = 0.12
+    template_fraction: float = 0.12
     """Share of the updates that fit the template alone, on near-rest frames."""
-    imitation_share: float = 0.2
+    pretraining_fraction: float = 0.2
     """Share of the updates that teach the network registered maps, without images; 0: no registration (the
     paper's). Registration itself takes no updates, but its time is part of the budget."""
-    pose_share: float = 0.0
+    pose_only_fraction: float = 0.0
     """Share that trains the network without feedback and memory (the paper's stage 1)."""
-    half_resolution_share: float = 0.85
+    half_resolution_fraction: float = 0.85
     """Share trained on images of half the size; the template is fitted to whole ones."""
-    streams: int = 64
+    rollouts_per_worker: int = 64
     """Rollouts that one worker advances together."""
     views: int = 1
     """Cameras rendered per rollout and rendered frame."""
-    rendered: float = 0.5
+    rendered_fraction: float = 0.5
     """Share of the frames, drawn by chance, that are rendered and compared; the network sees all."""
-    segment: int = 1
+    chunk_frames: int = 1
     """Frames K of truncated back-propagation through time (the paper gives none; its preset: 4). At equal
     time many rollouts of one frame teach more than few of several: the state carries on over whole clips."""
-    mirrored: float = 0.5
+    mirrored_fraction: float = 0.5
     """Share of the rollouts that see the mirrored motion (extension): the network learns from twice the
     motions; body and cloth must be cut symmetrically, their looks need not be."""
-    horizon: int = 0
+    max_rollout_frames: int = 0
     """Frames after which a rollout restarts when feedback begins; it doubles until clips are whole.
     0: whole clips from the start (a rollout that starts cold in mid-motion teaches the wrong thing)."""
     learning_rate: float = 2e-3
     """Peak rate of Adam for the network; cosine to 2 % of it."""
-    matrix_rate: float = 0.01
+    muon_rate: float = 0.01
     """Peak rate of Muon for the network's hidden convolutions, same cosine;
     0: Adam trains them too (the paper's)."""
     warmup: float = 0.03
     """Share of the network's training in which its rates rise from zero."""
     template_rate: float = 0.02
     """Factor on the template's rates once the network trains."""
-    refinement: float = 0.75
-    """Factor on the network's rates after imitation."""
-    clip: float = 1.0
+    finetuning_factor: float = 0.75
+    """Factor on the network's rates after pre-training."""
+    max_gradient_norm: float = 1.0
     """Largest norm of the network's gradient."""
 
 
@@ -225,7 +225,10 @@ class TrainConfig:
         if not model.channels:
             raise ConfigError("model.channels is empty; the encoder has at least one level")
         counts = {f"model.{name}": getattr(model, name) for name in ("upsample", "pixel_shuffle", "heads")}
-        counts |= {f"schedule.{name}": getattr(schedule, name) for name in ("streams", "segment", "views")}
+        counts |= {
+            f"schedule.{name}": getattr(schedule, name)
+            for name in ("rollouts_per_worker", "chunk_frames", "views")
+        }
         for name, count in counts.items():
             if count < 1:
                 raise ConfigError(f"{name} is {count}; it starts at 1")
@@ -251,10 +254,14 @@ class TrainConfig:
                 "model.causal is off, but the newest row of one attention sees every frame anyway: nothing "
                 "would change; give --model.readout mean too, and compare with that"
             )
-        if any(lag <= 0 for lag in model.lags):
-            raise ConfigError(f"model.lags is {model.lags}; they are seconds, above 0")
-        if not 0 < model.recall < 1:
-            raise ConfigError(f"model.recall is {model.recall}; it must lie strictly between 0 and 1")
+        if any(seconds <= 0 for seconds in model.mean_time_constants):
+            raise ConfigError(
+                f"model.mean_time_constants is {model.mean_time_constants}; they are seconds, above 0"
+            )
+        if not 0 < model.memory_weight < 1:
+            raise ConfigError(
+                f"model.memory_weight is {model.memory_weight}; it must lie strictly between 0 and 1"
+            )
         if not 0 <= model.sh_degree <= 3:
             raise ConfigError(f"model.sh_degree is {model.sh_degree}; harmonics go from degree 0 to 3")
         if self.schedule.steps < 1 or self.workers < 1:
@@ -280,12 +287,12 @@ PRESETS: dict[str, TrainConfig] = {
             window=10,
             memory=10,
             acceleration=False,
-            lags=(),
+            mean_time_constants=(),
             channels=(64, 128, 256, 512),
             heads=8,
             upsample=1,
-            identity_channels=0,
-            recall=0.1,
+            uv_feature_channels=0,
+            memory_weight=0.1,
             appearance_scale=1.0,
         ),
         loss=LossConfig(
@@ -302,15 +309,15 @@ PRESETS: dict[str, TrainConfig] = {
         schedule=ScheduleConfig(
             steps=300_000,
             learning_rate=6e-4,
-            half_resolution_share=0.0,
-            streams=1,
-            rendered=1.0,
-            segment=4,
-            imitation_share=0.0,
-            pose_share=0.15,
-            mirrored=0.0,
-            horizon=16,
-            matrix_rate=0.0,
+            half_resolution_fraction=0.0,
+            rollouts_per_worker=1,
+            rendered_fraction=1.0,
+            chunk_frames=4,
+            pretraining_fraction=0.0,
+            pose_only_fraction=0.15,
+            mirrored_fraction=0.0,
+            max_rollout_frames=16,
+            muon_rate=0.0,
         ),
     ),
 }

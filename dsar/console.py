@@ -13,7 +13,7 @@ ProgressStyle = Literal["auto", "rich", "plain", "none"]
 Item = TypeVar("Item")
 
 
-class Bar:
+class ProgressBar:
     """Progress of one job, in [0, 1], with a line of text."""
 
     def __init__(self, style: ProgressStyle, title: str) -> None:
@@ -42,15 +42,15 @@ class Bar:
             sys.stderr.flush()
 
     @contextmanager
-    def running(self) -> Iterator["Bar"]:
+    def running(self) -> Iterator["ProgressBar"]:
         """Draw the bar while the block runs."""
         with self._rich:
             yield self
 
 
-def follow(items: Iterable[Item], count: int, style: ProgressStyle, title: str) -> Iterator[Item]:
+def track_progress(items: Iterable[Item], count: int, style: ProgressStyle, title: str) -> Iterator[Item]:
     """Yield the items and show how many of `count` have passed."""
-    with Bar(style, title).running() as bar:
+    with ProgressBar(style, title).running() as bar:
         for done, item in enumerate(items, start=1):
             yield item
             bar.show(done / max(count, 1), f"{done}/{count}")

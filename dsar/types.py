@@ -184,9 +184,9 @@ class RenderOutput:
     median_depth: Float[Tensor, "h w"] | None = None
     """On request: z of the Gaussian with which transmittance falls to a half, else of the last one, metres; 0
     where nothing was hit. No gradient."""
-    front_depth: Float[Tensor, "h w"] | None = None
+    first_hit_depth: Float[Tensor, "h w"] | None = None
     """On request: z of the foremost Gaussian, metres; 0 where nothing was hit. No gradient."""
-    heaviest: Int[Tensor, "h w"] | None = None
+    largest_weight_id: Int[Tensor, "h w"] | None = None
     """On request: index of the Gaussian with the largest share, the foremost of equals; -1 where nothing was
     hit."""
     contributors: Contributors | None = None
@@ -319,7 +319,7 @@ class Capture(Protocol):
         """Sequence names of `train` and `test`, and of labelled subsets such as `nd` and `fd`."""
         ...
 
-    def seen_by(self, sequence: str, frame: int) -> Sequence[int]:
+    def cameras_with_image(self, sequence: str, frame: int) -> Sequence[int]:
         """Return the cameras that have an image of a frame with its mask, by index."""
         ...
 

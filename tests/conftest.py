@@ -75,7 +75,7 @@ def speckled(body, motion):
 def tiny_capture(tmp_path_factory) -> Path:
     """Return the folder of the tiny capture."""
     from dsar.body.files import load_body
-    from dsar.data.motion import write_motion
+    from dsar.data.motions.files import write_motion
     from dsar.raster import rasterize
 
     folder = tmp_path_factory.mktemp("tiny")
@@ -126,7 +126,16 @@ def tiny_capture(tmp_path_factory) -> Path:
 TINY = [
     *("--atlas.resolution", "32", "--atlas.garment", "off", "--model.channels", "8", "16"),
     *("--model.upsample", "2", "--model.heads", "2", "--model.window", "3", "--model.memory", "2"),
-    *("--schedule.horizon", "4", "--schedule.streams", "2", "--schedule.segment", "4", "--progress", "none"),
+    *(
+        "--schedule.max-rollout-frames",
+        "4",
+        "--schedule.rollouts-per-worker",
+        "2",
+        "--schedule.chunk-frames",
+        "4",
+        "--progress",
+        "none",
+    ),
 ]
 
 

@@ -15,7 +15,7 @@ import torch
 from PIL import Image
 
 from dsar.body.files import EMBEDDED_BODY
-from dsar.data.motion import turn_motion
+from dsar.data.motions.files import rotate_motion
 from dsar.geometry.rotations import axis_angle_from_matrix
 
 _JPG = {"quality": 100, "subsampling": 0}
@@ -164,7 +164,7 @@ def _opencv(capture, names, turn):
 
 
 def _turned(capture, motion, turn):
-    return motion if turn is None else turn_motion(motion, capture.body, turn)
+    return motion if turn is None else rotate_motion(motion, capture.body, turn)
 
 
 def _write_smplx(capture, sequence, folder, turn):

@@ -12,9 +12,9 @@ from torch import Tensor, nn
 from torch.nn.functional import conv2d, leaky_relu, linear
 
 from dsar.network import DualStreamNetwork, NetworkOutput
-from dsar.network.dual_stream import OFFSET_UNIT
 from dsar.network.encoder import Pyramid
 from dsar.network.layers import SLOPE, ConvBlock
+from dsar.network.model import OFFSET_UNIT
 
 # Nearest-neighbour doubling and a kernel of 3, as a transposed convolution of 4 and stride 2, along one axis.
 FOLD = torch.tensor([[0.0, 0, 1], [0, 1, 1], [1, 1, 0], [1, 0, 0]])
@@ -58,20 +58,20 @@ class LiteralNetwork(nn.Module):
             pooled = nn.functional.adaptive_avg_pool2d(torch.cat(list(magnitudes)), size)
             embedded = net.motion_embedding.out(block(net.motion_embedding.block, pooled))
             deep = [f + m for f, m in zip(deep, embedded.chunk(len(maps)), strict=True)]
-        tokens = torch.stack(deep, 1) + net.attention.age[:, :, None, None]
+        tokens = torch.stack(deep, 1) + net.attention.position_embedding[:, :, None, None]
         rows = attend(net.attention, tokens, tokens, causal=config.causal)
         aggregate = rows.mean(1) if config.readout == "mean" else rows[:, -1]
         hidden = aggregate
         left = aggregate if config.bank == "hidden" else deep[-1]
         if net.bank is not None:
             bank = torch.stack(list(memory) if memory else [left] * config.memory, 1)
-            bank = bank + net.bank.attention.age[:, :, None, None]
+            bank = bank + net.bank.attention.position_embedding[:, :, None, None]
             recalled = attend(net.bank.attention, aggregate[:, None], bank, causal=False)[:, 0]
-            share = torch.sigmoid(net.bank.recall_logit)
+            share = torch.sigmoid(net.bank.memory_logit)
             hidden = (1 - share) * aggregate + share * recalled
             left = hidden if config.bank == "hidden" else deep[-1]
         features = []
-        for frames, mixing in zip(levels, net.mixing, strict=False):
+        for frames, mixing in zip(levels, net.aggregation, strict=False):
             weighted = [f * w[:, None, None] for f, w in zip(frames, mixing.weights, strict=True)]
             features.append(project(mixing.mix, sum(weighted)))
         return self.decode([*features, hidden]), left
@@ -80,13 +80,13 @@ class LiteralNetwork(nn.Module):
         """Return the feature pyramids of a batch of frames, finest level first."""
         encoder, fold = self.network.encoder, self.network.config.pixel_shuffle
         maps, offsets = (nn.functional.pixel_unshuffle(x, fold) for x in (maps, offsets / OFFSET_UNIT))
-        static = [] if encoder.identity is None else [encoder.identity.expand(len(maps), -1, -1, -1)]
+        static = [] if encoder.uv_features is None else [encoder.uv_features.expand(len(maps), -1, -1, -1)]
         if self.network.config.wiring != "late":
-            return pyramid(encoder.poses, [maps, offsets, *static])
-        features = pyramid(encoder.poses, [maps, *static])
-        if encoder.offsets is None:
+            return pyramid(encoder.pyramid, [maps, offsets, *static])
+        features = pyramid(encoder.pyramid, [maps, *static])
+        if encoder.offset_pyramid is None:
             return features
-        thin = pyramid(encoder.offsets, [offsets])
+        thin = pyramid(encoder.offset_pyramid, [offsets])
         return [f + project(w, x) for f, w, x in zip(features, encoder.widen, thin, strict=True)]
 
     def decode(self, features: Sequence[Tensor]) -> NetworkOutput:
@@ -161,7 +161,7 @@ def project(layer: nn.Conv2d, x: Tensor) -> Tensor:
     return conv2d(x, layer.weight, layer.bias)
 
 
-def attend(layers: nn.Module, asking: Tensor, frames: Tensor, causal: bool) -> Tensor:
+def attend(layers: nn.Module, queries: Tensor, frames: Tensor, causal: bool) -> Tensor:
     """Return softmax(Q K^T / sqrt(d) + mask) V for every row, pixel and head (equations 9-12)."""
     b, n, c, h, w = frames.shape
 
@@ -170,9 +170,9 @@ def attend(layers: nn.Module, asking: Tensor, frames: Tensor, causal: bool) -> T
         x = linear(x, layer.weight[:, :, 0, 0], layer.bias)
         return x.reshape(b, -1, h * w, layers.heads, c // layers.heads).permute(0, 2, 3, 1, 4)
 
-    q, k, v = heads(layers.query, asking), heads(layers.key, frames), heads(layers.value, frames)
+    q, k, v = heads(layers.query, queries), heads(layers.key, frames), heads(layers.value, frames)
     scores = q @ k.mT / (c // layers.heads) ** 0.5
-    if causal and asking.shape[1] == n:
+    if causal and queries.shape[1] == n:
         scores = scores.masked_fill(~torch.ones(n, n, dtype=torch.bool, device=q.device).tril(), -torch.inf)
     rows = (scores.softmax(-1) @ v).permute(0, 3, 1, 2, 4).reshape(b, -1, h * w, c)
     rows = linear(rows, layers.out.weight[:, :, 0, 0], layers.out.bias)

@@ -47,7 +47,10 @@ def layers(picture: Picture) -> dict[str, Tensor]:
     """Return every image of a picture by name."""
     output, aovs = picture.output, picture.aovs
     found = {
-        **{name: getattr(output, name) for name in ("color", "alpha", "depth", "front_depth", "heaviest")},
+        **{
+            name: getattr(output, name)
+            for name in ("color", "alpha", "depth", "first_hit_depth", "largest_weight_id")
+        },
         **{name: getattr(aovs, name) for name in ("normals", "positions", "forward", "backward")},
         **aovs.coverage,
     }

@@ -2,9 +2,9 @@
 
     python tools/bake_motion.py 01_01.bvh --out dsar/data/embedded_motion/cmu_01_01.npz
 
-The clip moves the embedded body (`dsar.data.retarget`), and the soles stand on y = 0: a tenth of the frames
-may reach lower, as toes do that push off. CMU's clips come from mocap.cs.cmu.edu, created with funding from
-NSF EIA-0196217, free to use.
+The clip moves the embedded body (`dsar.data.motions.retargeting`), and the soles stand on y = 0: a tenth of
+the frames may reach lower, as toes do that push off. CMU's clips come from mocap.cs.cmu.edu, created with
+funding from NSF EIA-0196217, free to use.
 """
 
 import argparse
@@ -14,7 +14,7 @@ import torch
 
 from dsar.body.files import load_body
 from dsar.body.skinning import pose_vertices
-from dsar.data.motion import read_motion, resample, write_motion
+from dsar.data.motions.files import read_motion, resample, write_motion
 from dsar.types import Motion
 
 

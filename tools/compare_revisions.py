@@ -31,8 +31,15 @@ SMALL = (
 CASES = {
     "demo": (),
     "paper": (
-        *("--preset", "paper", *SMALL, "--loss.lpips", "0", "--schedule.half-resolution-share", "0.5"),
-        *("--schedule.streams", "2", "--schedule.horizon", "4", "--schedule.pose-share", "0.3"),
+        *("--preset", "paper", *SMALL, "--loss.lpips", "0", "--schedule.half-resolution-fraction", "0.5"),
+        *(
+            "--schedule.rollouts-per-worker",
+            "2",
+            "--schedule.max-rollout-frames",
+            "4",
+            "--schedule.pose-only-fraction",
+            "0.3",
+        ),
     ),
     "variants": (
         *(
@@ -54,10 +61,32 @@ CASES = {
             "--model.feedback",
             "3",
         ),
-        *("--schedule.imitation-share", "0", "--schedule.streams", "4", "--schedule.segment", "2"),
-        *("--schedule.mirrored", "0.5", "--loss.reduction", "sum", "--model.sh-degree", "1"),
+        *(
+            "--schedule.pretraining-fraction",
+            "0",
+            "--schedule.rollouts-per-worker",
+            "4",
+            "--schedule.chunk-frames",
+            "2",
+        ),
+        *("--schedule.mirrored-fraction", "0.5", "--loss.reduction", "sum", "--model.sh-degree", "1"),
     ),
 }
+BEFORE = {
+    "--schedule.rollouts-per-worker": "--schedule.streams",
+    "--schedule.max-rollout-frames": "--schedule.horizon",
+    "--schedule.chunk-frames": "--schedule.segment",
+    "--schedule.rendered-fraction": "--schedule.rendered",
+    "--schedule.mirrored-fraction": "--schedule.mirrored",
+    "--schedule.template-fraction": "--schedule.template-share",
+    "--schedule.pretraining-fraction": "--schedule.imitation-share",
+    "--schedule.pose-only-fraction": "--schedule.pose-share",
+    "--schedule.half-resolution-fraction": "--schedule.half-resolution-share",
+    "--schedule.muon-rate": "--schedule.matrix-rate",
+    "--schedule.finetuning-factor": "--schedule.refinement",
+    "--schedule.max-gradient-norm": "--schedule.clip",
+}
+"""Flags that had another name in revisions without a table of renamed settings."""
 RUN = """
 import sys
 import dsar.training.loop as loop, dsar.training.report as report
@@ -90,7 +119,9 @@ def run_in(tree: Path, code: str, *arguments: str) -> None:
 
 def renamed(tree: Path, flag: str) -> str:
     """Return a flag by the name that it has in a tree."""
-    return flag
+    sources = (tree / "dsar").glob("config*")
+    texts = [path.read_text() for path in sources if path.is_file()]
+    return BEFORE.get(flag, flag) if any("imitation_share: float" in text for text in texts) else flag
 
 
 def main() -> None:

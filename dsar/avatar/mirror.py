@@ -1,6 +1,6 @@
 """The left-right symmetry of bodies and cloth: a mirrored motion deforms the mirrored places alike.
 
-The mirror is the plane x = 0, of rest and of the world. A person's looks are not symmetric, so only
+The mirror is the plane x = 0, of rest and of the world. A person's appearance is not symmetric, so only
 what the network sees and predicts is mirrored: it learns from twice the motions, and the images stay.
 """
 
@@ -37,28 +37,28 @@ class Mirror:
             cells: Their flat grid indices.
         """
         flip = _FLIP.to(points)
-        nearest = [torch.cdist(some, points).argmin(1) for some in (points * flip).split(1024)]
+        nearest = [torch.cdist(chunk, points).argmin(1) for chunk in (points * flip).split(1024)]
         counterpart = torch.cat(nearest)
-        self._here, self._there = cells, cells[counterpart]
-        self._turn = axes.mT @ (flip[:, None] * axes[counterpart])
+        self._cells, self._counterpart_cells = cells, cells[counterpart]
+        self._change_of_axes = axes.mT @ (flip[:, None] * axes[counterpart])
 
-    def offset(self, offset: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
+    def mirror_offset(self, offset: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
         """Return mirrored offset maps."""
         flat = offset.flatten(2)
-        moved = self._turn @ flat[:, :, self._there].transpose(1, 2)[..., None]
-        return flat.index_copy(2, self._here, moved[..., 0].transpose(1, 2)).view_as(offset)
+        moved = self._change_of_axes @ flat[:, :, self._counterpart_cells].transpose(1, 2)[..., None]
+        return flat.index_copy(2, self._cells, moved[..., 0].transpose(1, 2)).view_as(offset)
 
-    def undo(self, output: NetworkOutput, which: Bool[Tensor, " b"]) -> NetworkOutput:
-        """Turn the answers of some rollouts, given to mirrored motions, into those to the motions.
+    def unmirror(self, output: NetworkOutput, which: Bool[Tensor, " b"]) -> NetworkOutput:
+        """Turn the outputs of the rollouts in `which`, made from mirrored motions, into those of the motions.
 
         Changes of rotation are dropped from them, and features are as they were.
         """
-        looks = output.appearance.flatten(2)
-        other = looks[:, :, self._there]
-        other = torch.cat([torch.zeros_like(other[:, _ROTATION]), other[:, _ROTATION.stop :]], 1)
-        appearance = looks.index_copy(2, self._here, other).view_as(output.appearance)
+        residuals = output.appearance.flatten(2)
+        mirrored = residuals[:, :, self._counterpart_cells]
+        mirrored = torch.cat([torch.zeros_like(mirrored[:, _ROTATION]), mirrored[:, _ROTATION.stop :]], 1)
+        appearance = residuals.index_copy(2, self._cells, mirrored).view_as(output.appearance)
         where = which[:, None, None, None]
-        offset = torch.where(where, self.offset(output.offset), output.offset)
+        offset = torch.where(where, self.mirror_offset(output.offset), output.offset)
         return NetworkOutput(offset, torch.where(where, appearance, output.appearance), output.features)
 
 

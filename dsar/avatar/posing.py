@@ -1,6 +1,6 @@
 """From canonical to posed Gaussians: linear blend skinning with proper rotations (paper equations 1 and 3).
 
-The blend of bone transforms moves the centres; its nearest rotation (polar factor) turns the
+The blend of bone transforms moves the centres; its nearest rotation (polar factor) rotates the
 covariances and the harmonics, in rendering and in every export alike. Neither depends on anything
 that is learnt, so the rotation needs no gradient and is computed by a compiled kernel.
 """
@@ -13,7 +13,7 @@ from torch import Tensor
 from dsar.geometry.harmonics import rotate_harmonics
 from dsar.geometry.rotations import quaternion_from_matrix, quaternion_multiply
 from dsar.raster.jit import inlined, kernel
-from dsar.raster.simd import LANES, choose, planes, square_root, write_plane
+from dsar.raster.simd import LANES, planes, select, sqrt, write_plane
 from dsar.types import Gaussians
 
 _POLAR_STEPS = 6
@@ -30,12 +30,12 @@ def pose_gaussians(
     """
     means, rotations, scales, opacities, harmonics = canonical
     posed_means = (blended[..., :3] * means[..., None, :]).sum(-1) + blended[..., 3]
-    turns = nearest_quaternions(blended[..., :3])
-    posed_rotations = quaternion_multiply(turns, rotations.expand_as(turns))
+    bone_rotations = nearest_quaternions(blended[..., :3])
+    posed_rotations = quaternion_multiply(bone_rotations, rotations.expand_as(bone_rotations))
     batch = len(blended)
     fields = [f.expand(batch, *f.shape[1:]) for f in (scales, opacities, harmonics)]
     if harmonics.shape[2] > 1:
-        fields[2] = rotate_harmonics(fields[2], turns)
+        fields[2] = rotate_harmonics(fields[2], bone_rotations)
     return [
         Gaussians(posed_means[i], posed_rotations[i], fields[0][i], fields[1][i], fields[2][i])
         for i in range(batch)
@@ -96,11 +96,11 @@ def _find_quaternions(scratch):
     ww, xx, yy, zz = a + e + k + _ONE, a - e - k + _ONE, e - a - k + _ONE, k - a - e + _ONE
     # Whichever is largest has the most digits, and the others follow from it.
     from_w, from_x, from_y = (ww >= xx) & (ww >= yy) & (ww >= zz), (xx >= yy) & (xx >= zz), yy >= zz
-    w = choose(from_w, ww, choose(from_x, h - f, choose(from_y, c - g, d - b)))
-    x = choose(from_w, h - f, choose(from_x, xx, choose(from_y, b + d, c + g)))
-    y = choose(from_w, c - g, choose(from_x, b + d, choose(from_y, yy, f + h)))
-    z = choose(from_w, d - b, choose(from_x, c + g, choose(from_y, f + h, zz)))
-    norm = _ONE / square_root(w * w + x * x + y * y + z * z)
-    norm = choose(w < _ZERO, -norm, norm)
-    for place, value in enumerate((w, x, y, z)):
-        write_plane(scratch, place, value * norm)
+    w = select(from_w, ww, select(from_x, h - f, select(from_y, c - g, d - b)))
+    x = select(from_w, h - f, select(from_x, xx, select(from_y, b + d, c + g)))
+    y = select(from_w, c - g, select(from_x, b + d, select(from_y, yy, f + h)))
+    z = select(from_w, d - b, select(from_x, c + g, select(from_y, f + h, zz)))
+    norm = _ONE / sqrt(w * w + x * x + y * y + z * z)
+    norm = select(w < _ZERO, -norm, norm)
+    for plane, value in enumerate((w, x, y, z)):
+        write_plane(scratch, plane, value * norm)

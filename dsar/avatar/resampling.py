@@ -13,25 +13,25 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dsar.avatar.track import find_jumps
+from dsar.avatar.driving import find_jumps
 from dsar.body.skinning import forward_kinematics
 from dsar.errors import MotionError
-from dsar.geometry.rates import exact_rate
+from dsar.geometry.frame_rates import exact_rate
 from dsar.network import NetworkOutput
 from dsar.types import Body, Motion
 
 
 @dataclass(frozen=True)
-class Moment:
+class RolloutTime:
     """Where a delivered frame lies in a rollout."""
 
     step: int
     """The rollout's frame at that time or, if there is none, right before it; counted from 0."""
-    share: float
+    fraction: float
     """How much of the way to the next frame has passed, in [0, 1); 0: it is the rollout's own frame."""
 
 
-def place_frames(body: Body, motion: Motion, delivered: Motion) -> list[Moment]:
+def locate_frames(body: Body, motion: Motion, delivered: Motion) -> list[RolloutTime]:
     """Return where each frame of a delivery lies in the rollout of a motion; both begin together.
 
     Times are exact: 24 and 24000/1001 frames a second meet 30 where they truly do. Across a jump of the body
@@ -50,34 +50,34 @@ def place_frames(body: Body, motion: Motion, delivered: Motion) -> list[Moment]:
     return [_place(frame * ratio, jumps) for frame in range(len(delivered))]
 
 
-def pose_frames(
-    body: Body, motion: Motion, delivered: Motion, moments: list[Moment]
+def delivery_transforms(
+    body: Body, motion: Motion, delivered: Motion, times: list[RolloutTime]
 ) -> Float[Tensor, "f j 4 4"]:
-    """Return T_world_rest of every joint at some moments of a rollout: its own where they are its frames."""
+    """Return T_world_rest of every joint at given times of a rollout: its own where they are its frames."""
     transforms = _transforms(body, delivered)
-    own = torch.tensor([moment.share == 0 for moment in moments], device=transforms.device)
-    steps = torch.tensor([moment.step for moment in moments], device=transforms.device)
+    own = torch.tensor([time.fraction == 0 for time in times], device=transforms.device)
+    steps = torch.tensor([time.step for time in times], device=transforms.device)
     transforms[own] = _transforms(body, motion)[steps[own]]
     return transforms
 
 
-def keep_residuals(output: NetworkOutput) -> NetworkOutput:
+def copy_residuals(output: NetworkOutput) -> NetworkOutput:
     """Return a copy of what poses Gaussians, which lasts while the network goes on."""
     return NetworkOutput(output.offset.clone(), output.appearance.clone(), ())
 
 
-def blend_residuals(first: NetworkOutput, second: NetworkOutput, share: float) -> NetworkOutput:
-    """Return the residuals some share of the way from one step to the next."""
-    offset = torch.lerp(first.offset, second.offset, share)
-    return NetworkOutput(offset, torch.lerp(first.appearance, second.appearance, share), ())
+def interpolate_residuals(first: NetworkOutput, second: NetworkOutput, fraction: float) -> NetworkOutput:
+    """Return the residuals a fraction of the way from one step to the next."""
+    offset = torch.lerp(first.offset, second.offset, fraction)
+    return NetworkOutput(offset, torch.lerp(first.appearance, second.appearance, fraction), ())
 
 
-def _place(time: Fraction, jumps: Collection[int]) -> Moment:
-    """Return the moment of a time in frames of the rollout."""
-    step, share = int(time), time % 1
+def _place(time: Fraction, jumps: Collection[int]) -> RolloutTime:
+    """Return where a time lies, in frames of the rollout."""
+    step, fraction = int(time), time % 1
     if step + 1 in jumps:
-        step, share = step + round(share), Fraction(0)
-    return Moment(step, float(share))
+        step, fraction = step + round(fraction), Fraction(0)
+    return RolloutTime(step, float(fraction))
 
 
 def _transforms(body: Body, motion: Motion) -> Float[Tensor, "f j 4 4"]:

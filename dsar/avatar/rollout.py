@@ -8,13 +8,19 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dsar.avatar.avatar import Avatar
-from dsar.avatar.resampling import Moment, blend_residuals, keep_residuals, place_frames, pose_frames
+from dsar.avatar.resampling import (
+    RolloutTime,
+    copy_residuals,
+    delivery_transforms,
+    interpolate_residuals,
+    locate_frames,
+)
 from dsar.body.model import JOINT_NAMES
 from dsar.errors import MotionError
-from dsar.geometry.paths import START_FRAME
-from dsar.geometry.rates import same_rate
+from dsar.geometry.camera_paths import START_FRAME
+from dsar.geometry.frame_rates import same_rate
 from dsar.network import STREAMS, NetworkOutput, Stream
-from dsar.network.streaming import Rollout
+from dsar.network.session import InferenceSession
 from dsar.types import Binding, Gaussians, GaussianSequence, Motion
 
 
@@ -36,7 +42,7 @@ def roll_out(
     Args:
         avatar: Who moves.
         motion: What the network sees.
-        delivered: The same motion at the rate of the frames that are wanted (`dsar.data.motion.resample`);
+        delivered: The same motion at the rate of the wanted frames (`dsar.data.motions.files.resample`);
             None: the avatar's. Frames that lie at a time of the rollout's own are those; see
             `dsar.avatar.resampling` for the others.
         frames: Which of the delivered frames.
@@ -62,14 +68,14 @@ def roll_out(
         )
     numbers = sorted(set(numbers))
     wanted = [number - START_FRAME for number in numbers]
-    moments = place_frames(avatar.body, motion, delivered)
-    poses = pose_frames(avatar.body, motion, delivered, moments)[wanted]
-    moments = [moments[frame] for frame in wanted]
+    times = locate_frames(avatar.body, motion, delivered)
+    poses = delivery_transforms(avatar.body, motion, delivered, times)[wanted]
+    times = [times[frame] for frame in wanted]
     return GaussianSequence(
         frame_numbers=numbers,
         fps=avatar.fps if same_rate(delivered.fps, avatar.fps) else delivered.fps,
         num_gaussians=avatar.num_gaussians,
-        produce=lambda: _produce(avatar, motion, moments, poses, streams),
+        produce=lambda: _produce(avatar, motion, times, poses, streams),
         provenance={"motion": motion.name, **(provenance or {})},
         binding=_bind(avatar, poses),
     )
@@ -94,12 +100,12 @@ def _bind(avatar: Avatar, poses: Float[Tensor, "f j 4 4"]) -> Binding:
 
 def template_sequence(sequence: GaussianSequence, avatar: Avatar, motion: Motion) -> GaussianSequence:
     """Return the same frames of the template under skinning alone: the baseline without a network."""
-    track = avatar.track(motion)
+    signal = avatar.driving_signal(motion)
 
     @torch.no_grad()
     def produce() -> Iterator[Gaussians]:
         for number in sequence.frame_numbers:
-            yield avatar.gaussians(track[[number - START_FRAME]], None)[0]
+            yield avatar.gaussians(signal[[number - START_FRAME]], None)[0]
 
     return dataclasses.replace(sequence, produce=produce)
 
@@ -107,37 +113,39 @@ def template_sequence(sequence: GaussianSequence, avatar: Avatar, motion: Motion
 def network_outputs(
     avatar: Avatar, motion: Motion, *, streams: Collection[Stream] = STREAMS
 ) -> Iterator[tuple[Float[Tensor, "1 t j 4 4"], NetworkOutput]]:
-    """Yield each frame's context and what the network makes of it.
+    """Yield each frame's motion window and what the network makes of it.
 
     On a GPU an output lasts until the next is asked for.
     """
-    track = avatar.track(motion)
-    rollout = Rollout(avatar.network, streams, torch.bfloat16 if track.is_cuda else None)
-    for frame in range(len(track)):
+    signal = avatar.driving_signal(motion)
+    session = InferenceSession(avatar.network, streams, torch.bfloat16 if signal.is_cuda else None)
+    for frame in range(len(signal)):
         with torch.no_grad():
-            context = track[[frame]]
-            output = rollout.step(*avatar.standardized(avatar.maps(context, avatar.fps)))
-        yield context, output
+            motion_window = signal[[frame]]
+            output = session.step(*avatar.standardize(avatar.input_maps(motion_window, avatar.fps)))
+        yield motion_window, output
 
 
 def _produce(
     avatar: Avatar,
     motion: Motion,
-    moments: Sequence[Moment],
+    times: Sequence[RolloutTime],
     poses: Float[Tensor, "f j 4 4"],
     streams: Collection[Stream],
 ) -> Iterator[Gaussians]:
-    """Yield the Gaussians at ascending moments of a rollout; `poses` are those of the body at each."""
+    """Yield the Gaussians at ascending times of a rollout; `poses` are those of the body at each."""
     steps = network_outputs(avatar, motion, streams=streams)
-    step, before, (context, output) = 0, None, next(steps)
-    for moment, pose in zip(moments, poses, strict=True):
-        while step < moment.step + (moment.share > 0):
-            before = keep_residuals(output)
+    step, before, (motion_window, output) = 0, None, next(steps)
+    for time, pose in zip(times, poses, strict=True):
+        while step < time.step + (time.fraction > 0):
+            before = copy_residuals(output)
             # After the last step its residuals stay.
-            step, (context, output) = step + 1, next(steps, (context, output))
+            step, (motion_window, output) = step + 1, next(steps, (motion_window, output))
         with torch.no_grad():
-            if before is None or moment.share == 0:
-                made = avatar.gaussians(context, output)[0]
+            if before is None or time.fraction == 0:
+                gaussians = avatar.gaussians(motion_window, output)[0]
             else:
-                made = avatar.gaussians(pose[None, None], blend_residuals(before, output, moment.share))[0]
-        yield made
+                gaussians = avatar.gaussians(
+                    pose[None, None], interpolate_residuals(before, output, time.fraction)
+                )[0]
+        yield gaussians

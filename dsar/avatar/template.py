@@ -9,12 +9,12 @@ from dsar.geometry.rotations import quaternion_from_matrix
 
 SCALE_RANGE = (2e-4, 0.1)
 """Standard deviations are kept within these metres."""
-SPREAD = 0.5
+SCALE_IN_TEXELS = 0.5
 """First standard deviations in texels: neighbours overlap without blurring each other."""
-SHOWN, HIDDEN = 2.0, -8.0
+VISIBLE_LOGIT, HIDDEN_LOGIT = 2.0, -8.0
 """First logits of opacity."""
 THICKNESS = 0.3
-"""First thickness as a share of the shorter side."""
+"""First thickness as a fraction of the shorter side."""
 
 
 class GaussianParameters(nn.Module):
@@ -34,10 +34,10 @@ class GaussianParameters(nn.Module):
         super().__init__()
         n = len(positions)
         self.means = nn.Parameter(positions.clone())
-        rotations, scales = footprint(tangents)
+        rotations, scales = texel_footprints(tangents)
         self.quaternions = nn.Parameter(rotations)
         self.log_scales = nn.Parameter(scales.log())
-        self.opacity_logits = nn.Parameter(torch.where(hidden, HIDDEN, SHOWN))
+        self.opacity_logits = nn.Parameter(torch.where(hidden, HIDDEN_LOGIT, VISIBLE_LOGIT))
         harmonics = torch.zeros(n, (sh_degree + 1) ** 2, 3)
         harmonics[:, 0] = dc_from_color(torch.tensor([0.5, 0.5, 0.5]))
         self.harmonics = nn.Parameter(harmonics)
@@ -55,16 +55,16 @@ class GaussianParameters(nn.Module):
         quaternions, log_scales = self.quaternions[None], self.log_scales[None]
         logits, harmonics, means = self.opacity_logits[None], self.harmonics[None], self.means[None]
         if offset is not None and appearance is not None:
-            turn, stretch, logit, shade = appearance.split([4, 3, 1, appearance.shape[-1] - 8], -1)
+            quaternion, log_scale, logit, harmonic = appearance.split([4, 3, 1, appearance.shape[-1] - 8], -1)
             means = means + offset
-            quaternions, log_scales = quaternions + turn, log_scales + stretch
+            quaternions, log_scales = quaternions + quaternion, log_scales + log_scale
             logits = logits + logit.squeeze(-1)
-            harmonics = harmonics + shade.unflatten(-1, (-1, 3))
+            harmonics = harmonics + harmonic.unflatten(-1, (-1, 3))
         rotations = nn.functional.normalize(quaternions, dim=-1)
         return means, rotations, log_scales.exp().clamp(*SCALE_RANGE), logits.sigmoid(), harmonics
 
 
-def footprint(
+def texel_footprints(
     tangents: Float[Tensor, "n 3 2"],
 ) -> tuple[Float[Tensor, "n 4"], Float[Tensor, "n 3"]]:
     """Return rotations (wxyz) and standard deviations that make each Gaussian its texel's footprint.
@@ -81,5 +81,5 @@ def footprint(
     directions = directions * torch.where((directions * tangents).sum(1, keepdim=True) < 0, -1, 1)
     normals = torch.linalg.cross(directions[..., 0], directions[..., 1])
     axes = torch.cat([directions, normals[..., None]], -1)
-    scales = SPREAD * torch.cat([sides, THICKNESS * sides.amin(1, keepdim=True)], 1)
+    scales = SCALE_IN_TEXELS * torch.cat([sides, THICKNESS * sides.amin(1, keepdim=True)], 1)
     return quaternion_from_matrix(axes), scales.clamp(*SCALE_RANGE)

@@ -1,6 +1,6 @@
 """Forward kinematics and linear blend skinning with SMPL-X semantics, differentiable in every input.
 
-vertex = sum_k w_k T_k v_rest, where T_k turns joint k, and all that hangs on it, about the joint's
+vertex = sum_k w_k T_k v_rest, where T_k rotates joint k, and all that hangs on it, about the joint's
 rest position, and `translation` is added last (Loper et al. 2015, without pose blend shapes: what a
 pose does beyond skinning is learned).
 """
@@ -31,9 +31,11 @@ def forward_kinematics(
     for joint in range(1, len(local)):
         world.append(world[body.parents[joint]] @ local[joint])
     posed = torch.stack(world, -3)
-    turns, heads = posed[..., :3, :3], posed[..., :3, 3]
-    shifts = heads - (turns @ body.joints[:, :, None]).squeeze(-1) + translations[..., None, :]
-    return _rigid(turns, shifts)
+    world_rotations, joint_positions = posed[..., :3, :3], posed[..., :3, 3]
+    shifts = (
+        joint_positions - (world_rotations @ body.joints[:, :, None]).squeeze(-1) + translations[..., None, :]
+    )
+    return _rigid(world_rotations, shifts)
 
 
 def blend_transforms(

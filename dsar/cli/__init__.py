@@ -11,6 +11,7 @@ from typing import Annotated, NoReturn
 
 import tyro
 
+from dsar.atomic_files import explain_os_error
 from dsar.cli.check import Check
 from dsar.cli.crosscheck import Crosscheck
 from dsar.cli.export import Export
@@ -18,7 +19,6 @@ from dsar.cli.measure import Eval, Stress
 from dsar.cli.render import Render
 from dsar.cli.train import Train
 from dsar.config import PRESETS
-from dsar.drafts import explain
 from dsar.errors import DsarError, RenderError, StorageError
 
 Command = Train | Check | Export | Render | Eval | Stress | Crosscheck
@@ -77,7 +77,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         command = parse(sys.argv[1:] if arguments is None else arguments)
         with _cleaning_up_when_terminated():
-            command.check_places()
+            command.check_outputs_writable()
             _run(command)
     except DsarError as error:
         # What was done of a batch is there; what was asked for was right.
@@ -90,7 +90,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         _leave("interrupted before any work", _INTERRUPTED)
     except OSError as error:
         what = f"{error.filename}: " if error.filename else ""
-        _leave(what + explain(error), 2, error)
+        _leave(what + explain_os_error(error), 2, error)
 
 
 def _run(command: Command) -> None:
@@ -98,12 +98,12 @@ def _run(command: Command) -> None:
     try:
         command.run()
     except StorageError as error:
-        raise StorageError(f"{error}; {command.kept()}") from error
+        raise StorageError(f"{error}; {command.describe_remains()}") from error
     except KeyboardInterrupt:
-        _leave(f"interrupted; {command.kept()}", _INTERRUPTED)
+        _leave(f"interrupted; {command.describe_remains()}", _INTERRUPTED)
     except SystemExit as stop:
         if stop.code == _TERMINATED:
-            _leave(f"terminated; {command.kept()}", _TERMINATED)
+            _leave(f"terminated; {command.describe_remains()}", _TERMINATED)
         raise
 
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import tyro
 
-from dsar.cli.common import Common, file_stem
+from dsar.cli.command import Common, file_stem
 from dsar.config import PRESETS
-from dsar.console import Bar
+from dsar.console import ProgressBar
 
 _MINUTES = 60.0
 _SHEETS = Path("runs/check")
@@ -30,27 +30,27 @@ class Check(Common):
     sheet: Path | None = None
     """PNG of the body over the images; default runs/check/NAME.png."""
 
-    def files(self) -> list[Path]:
+    def output_files(self) -> list[Path]:
         """Return the sheet, where it has a name already."""
         return [] if self.sheet is None else [self.sheet]
 
-    def folders(self) -> list[Path]:
+    def output_folders(self) -> list[Path]:
         """Return where a sheet goes that has none."""
         return [_SHEETS] if self.sheet is None else []
 
     def run(self) -> None:
         """Check, print, write the sheet; exit with 2 where the capture cannot train."""
-        from dsar.data.capture import open_capture
+        from dsar.data.captures.formats import open_capture
         from dsar.evaluation.check import check_capture, draw_overlays
-        from dsar_render import write_sheet
+        from dsar_render import write_contact_sheet
 
         capture = open_capture(
             self.capture, body=self.body, train_frames=self.train_frames, test_frames=self.test_frames
         )
-        with Bar(self.progress, "check").running() as bar:
+        with ProgressBar(self.progress, "check").running() as bar:
             verdict = check_capture(capture, lambda what, share: bar.show(share, what))
         rows, columns = draw_overlays(capture)
-        sheet = write_sheet(
+        sheet = write_contact_sheet(
             self.sheet or _SHEETS / f"{file_stem(capture.name)}.png",
             rows,
             columns=columns,

@@ -5,14 +5,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dsar.cli.common import OnRun, capture_sequence, file_stem
-from dsar.console import Bar
+from dsar.cli.command import RunCommand, file_stem, resolve_sequence
+from dsar.console import ProgressBar
 from dsar.errors import ConfigError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from dsar.data.capture import MultiViewCapture
+    from dsar.data.captures.formats import MultiViewCapture
     from dsar.training.scene import Scene
     from dsar.types import Body, Gaussians
     from dsar_render.crosscheck import Shape
@@ -21,7 +21,7 @@ _PAGES = Path("runs/check")
 
 
 @dataclass(frozen=True)
-class Crosscheck(OnRun):
+class Crosscheck(RunCommand):
     """Prove cameras, files and images of a run, or of a capture, by another renderer: Mitsuba."""
 
     capture: str | None = None
@@ -35,11 +35,11 @@ class Crosscheck(OnRun):
     report: Path | None = None
     """The page; default: crosscheck.html in the run's folder, or runs/check/NAME.crosscheck.html."""
 
-    def files(self) -> list[Path]:
+    def output_files(self) -> list[Path]:
         """Return the page, where it has a name already."""
         return [] if self.report is None else [self.report]
 
-    def folders(self) -> list[Path]:
+    def output_folders(self) -> list[Path]:
         """Return where a page goes that has none."""
         if self.report is not None:
             return []
@@ -47,7 +47,7 @@ class Crosscheck(OnRun):
 
     def run(self) -> None:
         """Check, print, write the report; exit with 1 where something is wrong."""
-        from dsar_exporters import written_projections
+        from dsar_exporters import read_back_projections
         from dsar_render.crosscheck import (
             cross_check,
             ellipsoids,
@@ -63,12 +63,12 @@ class Crosscheck(OnRun):
         capture, body, drive, page = self.open()
         shapes = [self.posed(capture, body)]
         cameras = list(capture.cameras)
-        written = written_projections(cameras)
+        written = read_back_projections(cameras)
         mi = load_mitsuba(self.variant)
         gaussians = drive() if drive else None
         if gaussians is not None:
             shapes.append(ellipsoids(gaussians))
-        with Bar(self.progress, "crosscheck").running() as bar:
+        with ProgressBar(self.progress, "crosscheck").running() as bar:
             verdict = cross_check(
                 *(mi, cameras, written, shapes, gaussians), lambda what, share: bar.show(share, what)
             )
@@ -91,7 +91,7 @@ class Crosscheck(OnRun):
         """Return cameras and motions, the body, what makes a run's Gaussians of the frame, and the page."""
         from dsar.avatar import roll_out
         from dsar.avatar.rollout import START_FRAME
-        from dsar.data.capture import open_capture
+        from dsar.data.captures.formats import open_capture
         from dsar.training.checkpoint import Run, load_checkpoint
         from dsar.training.scene import open_scene
 
@@ -113,7 +113,7 @@ class Crosscheck(OnRun):
         """Return the sequence whose pose is shown; check that it has the frame."""
         name = next(iter(capture.motions))
         if capture.splits.get("test"):
-            name = capture_sequence(capture, "test") or name
+            name = resolve_sequence(capture, "test") or name
         length = len(capture.motions[name])
         if not 0 <= self.frame < length:
             raise ConfigError(

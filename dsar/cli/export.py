@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dsar.cli.common import shown
-from dsar.cli.drive import Drive, Performance
+from dsar.cli.command import with_progress
+from dsar.cli.drive_command import DriveCommand, DrivenAvatar
 from dsar.errors import CheckpointError, ConfigError
 from dsar.types import Camera
 
@@ -19,7 +19,7 @@ LOGGER = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Export(Drive):
+class Export(DriveCommand):
     """Drive an avatar with a motion and write the Gaussians of each frame."""
 
     usd: Path | None = None
@@ -43,15 +43,15 @@ class Export(Drive):
     check: Path | None = None
     """Write nothing; say what is wrong with this file, whoever wrote it (USD, PLY, SPZ or GLB)."""
 
-    def files(self) -> list[Path]:
+    def output_files(self) -> list[Path]:
         """Return the files of a name of their own."""
         return [path for path in (self.usd, self.glb) if path is not None]
 
-    def folders(self) -> list[Path]:
+    def output_folders(self) -> list[Path]:
         """Return the folders of sequences."""
         return [path for path in (self.ply, self.compressed_ply, self.spz) if path is not None]
 
-    def kept(self) -> str:
+    def describe_remains(self) -> str:
         """Return what is left."""
         return "no file is half written; of splat sequences the frames that were finished stay"
 
@@ -62,31 +62,31 @@ class Export(Drive):
             return
         from dsar_exporters import export
 
-        if not self.files() and not self.folders():
+        if not self.output_files() and not self.output_folders():
             raise ConfigError(
                 "dsar export: nothing to write; give --usd out.usda, --ply DIR, --compressed-ply DIR, "
                 "--spz DIR, --glb FILE or --check FILE"
             )
         self.check_name(self.name)
-        wanted = self.wanted_frames()
-        performance = self.open()
-        sequence = performance.roll_out(wanted)
-        outputs = self.outputs(self.cameras(performance))
-        delivered = export(shown(sequence, self.progress, "export"), list(outputs.values()))
+        wanted = self.requested_frames()
+        driven = self.open()
+        sequence = driven.roll_out(wanted)
+        outputs = self.outputs(self.cameras(driven))
+        delivered = export(with_progress(sequence, self.progress, "export"), list(outputs.values()))
         facts = {"gaussians": sequence.num_gaussians, "frames": len(sequence), "fps": sequence.fps}
         written = {name: str(output.path) for name, output in outputs.items()}
         files = {
             name: {"files": each.files, "bytes": each.size, "seconds": each.seconds}
             for name, each in zip(outputs, delivered, strict=True)
         }
-        self.write_json({"motion": performance.motion.name, "written": written, "cost": files, **facts})
+        self.write_json({"motion": driven.motion.name, "written": written, "cost": files, **facts})
 
-    def cameras(self, performance: Performance) -> Sequence[Camera]:
+    def cameras(self, driven: DrivenAvatar) -> Sequence[Camera]:
         """Return the capture's cameras for formats that have cameras; none, and say so, if they are gone."""
         if self.usd is None:
             return ()
         try:
-            return performance.cameras
+            return driven.cameras
         except CheckpointError as error:
             LOGGER.warning("--usd %s: of all cameras it has the turntable alone: %s", self.usd, error)
             return ()

@@ -5,13 +5,13 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from dsar.cli.common import OnRun, capture_sequence
+from dsar.cli.command import RunCommand, resolve_sequence
 from dsar.cli.previews import write_worst
-from dsar.console import Bar, follow
+from dsar.console import ProgressBar, track_progress
 
 
 @dataclass(frozen=True)
-class Eval(OnRun):
+class Eval(RunCommand):
     """Measure a run on the frames it never saw; or train and measure the models of the paper's tables."""
 
     ablations: bool = False
@@ -29,17 +29,21 @@ class Eval(OnRun):
     chart: Path | None = None
     """Draw the tables' models, speed against accuracy, to this file (.svg, .png)."""
 
-    def files(self) -> list[Path]:
+    def output_files(self) -> list[Path]:
         """Return the chart."""
         return [] if self.chart is None else [self.chart]
 
-    def folders(self) -> list[Path]:
+    def output_folders(self) -> list[Path]:
         """Return the folder of the tables' models, or the run, which keeps its figures and report."""
         return [self.study if self.is_study else self.chosen_run()]
 
-    def kept(self) -> str:
+    def describe_remains(self) -> str:
         """Return what is left."""
-        return "models that were measured stay; the same command goes on" if self.is_study else super().kept()
+        return (
+            "models that were measured stay; the same command goes on"
+            if self.is_study
+            else super().describe_remains()
+        )
 
     @property
     def is_study(self) -> bool:
@@ -55,33 +59,33 @@ class Eval(OnRun):
 
     def run_study(self) -> None:
         """Train and measure what the tables lack; print them."""
+        from dsar.atomic_files import write_text_atomically
         from dsar.config import absolute_capture
-        from dsar.drafts import write_whole
         from dsar.evaluation.study import ABLATIONS, BASELINES, Study, summarize_tables, to_markdown
-        from dsar.evaluation.study.chart import draw_chart, points_of, times_of
+        from dsar.evaluation.study.chart import chart_points, draw_chart, training_time_series
 
         self.check_device()
         every = ABLATIONS | BASELINES
         tables = (ABLATIONS if self.ablations else {}) | (BASELINES if self.baselines else {})
         capture = absolute_capture(self.capture)
         study = Study(self.study, self.minutes, capture)
-        with Bar(self.progress, "study").running() as bar:
+        with ProgressBar(self.progress, "study").running() as bar:
             complete = study.run(list(tables.values()), self.hours, lambda what, share: bar.show(share, what))
         summary = summarize_tables(study, tables)
         facts = {"complete": complete, "minutes": self.minutes, "capture": capture}
         self.write_json(facts | {"tables": summary})
         found = facts | {"tables": summarize_tables(study, every)}
-        write_whole(self.study / "study.json", json.dumps(found, indent=1) + "\n")
+        write_text_atomically(self.study / "study.json", json.dumps(found, indent=1) + "\n")
         sys.stdout.write(to_markdown(summary))
         if not complete:
             sys.stdout.write("\nNot complete: the same command goes on with what is missing.\n")
-        points = points_of(summary)
+        points = chart_points(summary)
         if self.chart is not None and points:
-            draw_chart(points, times_of(summary), self.chart)
+            draw_chart(points, training_time_series(summary), self.chart)
 
     def run_heldout(self) -> None:
         """Measure one run."""
-        from dsar.drafts import write_whole
+        from dsar.atomic_files import write_text_atomically
         from dsar.evaluation.heldout import evaluate
         from dsar.evaluation.report import write_report
         from dsar.training.checkpoint import Run, load_checkpoint
@@ -93,7 +97,7 @@ class Eval(OnRun):
         figures = evaluate(avatar, open_images(run, config))
         self.write_json(figures)
         write_worst(run.folder, figures["worst"])
-        write_whole(run.figures, json.dumps(figures, indent=2) + "\n")
+        write_text_atomically(run.figures, json.dumps(figures, indent=2) + "\n")
         write_report(run)
         for split, values in figures["splits"].items():
             if values is not None:
@@ -105,16 +109,16 @@ class Eval(OnRun):
 
 
 @dataclass(frozen=True)
-class Stress(OnRun):
+class Stress(RunCommand):
     """Drive an avatar where rollouts fail."""
 
-    def folders(self) -> list[Path]:
+    def output_folders(self) -> list[Path]:
         """Return the run, which keeps its verdicts and report."""
         return [self.chosen_run()]
 
     def run(self) -> None:
         """Run the battery on the held-out motion that is furthest from training; print each verdict."""
-        from dsar.drafts import write_whole
+        from dsar.atomic_files import write_text_atomically
         from dsar.evaluation.report import write_report
         from dsar.evaluation.stress import CASES, stress
         from dsar.training.checkpoint import Run, load_checkpoint
@@ -124,9 +128,9 @@ class Stress(OnRun):
         run = Run(self.chosen_run())
         avatar, config, _ = load_checkpoint(run)
         scene = open_scene(run, config)
-        verdicts = stress(avatar, scene.motions[capture_sequence(scene, "test") or ""], CASES)
+        verdicts = stress(avatar, scene.motions[resolve_sequence(scene, "test") or ""], CASES)
         found = {}
-        for name, verdict in follow(verdicts, len(CASES), self.progress, "stress"):
+        for name, verdict in track_progress(verdicts, len(CASES), self.progress, "stress"):
             found[name] = verdict.to_json()
             outcome = "passed" if verdict.passed else "FAILED"
             sys.stdout.write(f"{name:9s} {outcome}  {verdict.describe()}\n")
@@ -134,5 +138,5 @@ class Stress(OnRun):
         sys.stdout.write(f"{survived} of {len(found)} passed\n")
         battery = {"cases": found, "survived": survived, "tried": len(found)}
         self.write_json(battery)
-        write_whole(run.stress, json.dumps(battery, indent=2) + "\n")
+        write_text_atomically(run.stress, json.dumps(battery, indent=2) + "\n")
         write_report(run)

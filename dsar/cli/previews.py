@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from dsar.cli.common import capture_sequence
+from dsar.cli.command import resolve_sequence
 
 _log = logging.getLogger(__name__)
 _COLUMNS = 10
@@ -29,7 +29,7 @@ def write_previews(folder: Path) -> Path:
 
 def write_contact_sheet(folder: Path) -> Path:
     """Write truth above prediction for some frames and cameras of the run's test motion."""
-    from dsar_render import write_sheet
+    from dsar_render import write_contact_sheet
 
     scene = _Scene(folder)
     last = len(scene.capture.motions[scene.far]) - 1
@@ -42,7 +42,7 @@ def write_contact_sheet(folder: Path) -> Path:
     for _, camera, image in scene.images(scene.far, frames, scene.some_cameras()):
         rows[f"{scene.capture.cameras[camera].name} dsar"].append(image)
     columns = [f"{scene.far} {scene.first + frame}" for frame in frames]
-    return write_sheet(folder / "previews" / "sheet.png", rows, columns=columns)
+    return write_contact_sheet(folder / "previews" / "sheet.png", rows, columns=columns)
 
 
 def write_comparison(folder: Path) -> Path:
@@ -69,7 +69,7 @@ def write_comparison(folder: Path) -> Path:
 
 def write_worst(folder: Path, views: Sequence[dict[str, Any]]) -> Path:
     """Write truth above prediction for views of held-out sequences."""
-    from dsar_render import write_sheet
+    from dsar_render import write_contact_sheet
 
     scene, pairs = _Scene(folder), {}
     for name in dict.fromkeys(view["sequence"] for view in views):
@@ -83,7 +83,7 @@ def write_worst(folder: Path, views: Sequence[dict[str, Any]]) -> Path:
     columns = [
         f"{name} {scene.first + frame} {scene.capture.cameras[camera].name}" for name, frame, camera in order
     ]
-    return write_sheet(folder / "previews" / "worst.png", rows, columns=columns)
+    return write_contact_sheet(folder / "previews" / "worst.png", rows, columns=columns)
 
 
 class _Scene:
@@ -97,7 +97,7 @@ class _Scene:
         run = Run(folder)
         self.avatar, config, _ = load_checkpoint(run)
         self.capture, self.first = open_images(run, config), START_FRAME
-        self.far = capture_sequence(self.capture, "test") or ""
+        self.far = resolve_sequence(self.capture, "test") or ""
 
     def some_cameras(self) -> list[int]:
         """Return three cameras, a third of the ring apart where they stand in one."""
@@ -110,7 +110,7 @@ class _Scene:
 
         from dsar.evaluation.views import to_bytes, true_view
 
-        if camera not in self.capture.seen_by(sequence, frame):
+        if camera not in self.capture.cameras_with_image(sequence, frame):
             view = self.capture.cameras[camera]
             return np.full((view.height, view.width, 3), 255, np.uint8)
         return to_bytes(true_view(self.capture, sequence, frame, camera).color)

@@ -10,13 +10,13 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from dsar.cli.drive import Drive, Performance
-from dsar.cli.expect import check_inputs, to_flag
+from dsar.cli.drive_command import DriveCommand, DrivenAvatar
+from dsar.cli.expected_inputs import check_inputs, to_flag
 from dsar.config import EMBEDDED
-from dsar.console import follow
+from dsar.console import track_progress
 from dsar.errors import CheckpointError, ConfigError
 from dsar.geometry.camera_files import cameras_to_json, list_cameras_json, read_cameras_json
-from dsar.geometry.paths import DOLLY, ORBIT, TURNTABLE, CameraPath, dolly, orbit, turntable
+from dsar.geometry.camera_paths import DOLLY, ORBIT, TURNTABLE, CameraPath, dolly, orbit, turntable
 
 if TYPE_CHECKING:
     from dsar_exporters import ColorTarget
@@ -28,7 +28,7 @@ _MADE = {TURNTABLE: turntable, ORBIT: orbit, DOLLY: dolly}
 
 
 @dataclass(frozen=True)
-class Render(Drive):
+class Render(DriveCommand):
     """Drive an avatar with a motion and render image sequences."""
 
     exr: Path | None = None
@@ -83,17 +83,17 @@ class Render(Drive):
     name: str = "avatar"
     """Name in the files."""
 
-    def files(self) -> list[Path]:
+    def output_files(self) -> list[Path]:
         """Return the video and the farm's job."""
         return [path for path in (self.mp4, self.openjd) if path is not None]
 
-    def folders(self) -> list[Path]:
+    def output_folders(self) -> list[Path]:
         """Return the folders of image sequences; a farm's job writes none."""
         return [path for path in (self.exr, self.png) if path is not None and self.openjd is None]
 
-    def kept(self) -> str:
+    def describe_remains(self) -> str:
         """Return what is left."""
-        if not self.folders():
+        if not self.output_folders():
             return "nothing was written"
         return "the images that were finished stay; the same command with --skip-existing goes on"
 
@@ -112,35 +112,35 @@ class Render(Drive):
             )
         # With more threads sums are added in another order, and bytes would depend on the number of cores.
         torch.set_num_threads(1)
-        wanted = self.wanted_frames()
+        wanted = self.requested_frames()
         settings = self.settings()
         writers = tuple(self.writers())
-        performance = self.open()
-        whole = performance.roll_out()
+        driven = self.open()
+        whole = driven.roll_out()
         frames = wanted or list(whole.frame_numbers)
-        performance.roll_out(frames)  # names frames that are not in the motion
-        paths = self.paths(performance, frames)
+        driven.roll_out(frames)  # names frames that are not in the motion
+        paths = self.paths(driven, frames)
         if self.expect is not None:
-            check_inputs(self.expect, self.inputs(performance))
+            check_inputs(self.expect, self.inputs(driven))
         shot = Shot(tuple(paths), writers, settings, previews=self.mp4 is not None)
         if self.openjd is not None:
-            self.write_template(self.openjd, performance, frames)
+            self.write_template(self.openjd, driven, frames)
             return
-        rendered = self.render(performance, shot, frames)
+        rendered = self.render(driven, shot, frames)
         self.write_json(
             {
-                "motion": performance.motion.name,
+                "motion": driven.motion.name,
                 "images": rendered * len(paths),
                 "skipped": (len(frames) - rendered) * len(paths),
                 "cameras": [path.name for path in paths],
             }
         )
 
-    def render(self, performance: Performance, shot: "Shot", frames: Sequence[int]) -> int:
+    def render(self, driven: DrivenAvatar, shot: "Shot", frames: Sequence[int]) -> int:
         """Render what is not there yet; return how many frames that was."""
-        from dsar_render import render_shot, with_neighbours, write_mp4
+        from dsar_render import add_neighbours, render_shot, write_mp4
 
-        whole = performance.roll_out()
+        whole = driven.roll_out()
         facts = dict(whole.provenance)
         # A video needs every frame.
         if self.skip_existing and self.mp4 is None:
@@ -148,15 +148,15 @@ class Render(Drive):
         if not frames:
             return 0
         every = whole.frame_numbers
-        rolled = with_neighbours(frames, every[0], every[-1]) if shot.settings.needs_neighbours else frames
-        sequence = performance.roll_out(rolled)
+        rolled = add_neighbours(frames, every[0], every[-1]) if shot.settings.needs_neighbours else frames
+        sequence = driven.roll_out(rolled)
         done = render_shot(shot, sequence, frames, jobs=self.jobs, scheduler=self.scheduler)
-        shown = follow(done, len(frames), self.progress, "render")
+        with_progress = track_progress(done, len(frames), self.progress, "render")
         if self.mp4 is None:
-            for _ in shown:
+            for _ in with_progress:
                 pass
         else:
-            write_mp4((image for _, image in shown if image is not None), self.mp4, fps=sequence.fps)
+            write_mp4((image for _, image in with_progress if image is not None), self.mp4, fps=sequence.fps)
         return len(frames)
 
     def settings(self) -> "RenderSettings":
@@ -195,11 +195,11 @@ class Render(Drive):
         absolute = config if config.startswith("ocio://") else str(Path(config).absolute())
         return ColorTarget(self.colorspace, absolute)
 
-    def paths(self, performance: Performance, frames: Sequence[int]) -> list[CameraPath]:
+    def paths(self, driven: DrivenAvatar, frames: Sequence[int]) -> list[CameraPath]:
         """Return the cameras to render, at the requested resolution."""
-        whole = performance.roll_out()
-        names = self.camera_names(performance)
-        rig = self.rig(performance, frames)
+        whole = driven.roll_out()
+        names = self.camera_names(driven)
+        rig = self.rig(driven, frames)
         found: list[CameraPath] = []
         for wanted in self.camera.split(","):
             if wanted in _MADE and wanted not in names:
@@ -219,11 +219,11 @@ class Render(Drive):
         self.check_together(sized)
         return sized
 
-    def camera_names(self, performance: Performance) -> list[str]:
+    def camera_names(self, driven: DrivenAvatar) -> list[str]:
         """Return the names of the cameras to choose from: the capture's, or a file's."""
         if self.cameras is None:
             try:
-                return [camera.name for camera in performance.cameras]
+                return [camera.name for camera in driven.cameras]
             except CheckpointError:
                 # Those made for the motion need none of the capture's but for their size.
                 if self.res is None or not set(self.camera.split(",")) <= _MADE.keys():
@@ -235,9 +235,9 @@ class Render(Drive):
             return list_usd_cameras(self.cameras)
         return list_cameras_json(self.cameras)
 
-    def rig(self, performance: Performance, frames: Sequence[int]) -> list[CameraPath]:
+    def rig(self, driven: DrivenAvatar, frames: Sequence[int]) -> list[CameraPath]:
         """Return the chosen cameras alone: others may be of a kind that cannot be drawn."""
-        names, wanted = self.camera_names(performance), self.camera.split(",")
+        names, wanted = self.camera_names(driven), self.camera.split(",")
         chosen = {name for name in names if any(_means(each, name) for each in wanted)}
         if self.res is None and any(each in _MADE and each not in names for each in wanted):
             # Cameras that are made here have the first one's size.
@@ -245,8 +245,8 @@ class Render(Drive):
         if not chosen:
             return []
         if self.cameras is None:
-            return [CameraPath((camera,)) for camera in performance.cameras if camera.name in chosen]
-        fps = performance.delivered.fps
+            return [CameraPath((camera,)) for camera in driven.cameras if camera.name in chosen]
+        fps = driven.delivered.fps
         if _is_usd(self.cameras):
             from dsar_exporters import read_usd_cameras
 
@@ -264,33 +264,33 @@ class Render(Drive):
                 "--mp4: expected cameras of one height, found several: give one size with --res W H"
             )
 
-    def inputs(self, performance: Performance) -> dict[str, str]:
+    def inputs(self, driven: DrivenAvatar) -> dict[str, str]:
         """Return hashes of all that pictures depend on besides the command itself, by what they are of."""
-        found = {"dsar": version("dsar-avatar"), **performance.inputs}
-        rig = self.rig(performance, performance.roll_out().frame_numbers)
+        found = {"dsar": version("dsar-avatar"), **driven.inputs}
+        rig = self.rig(driven, driven.roll_out().frame_numbers)
         if rig:
             found["cameras"] = sha256(cameras_to_json(rig).encode()).hexdigest()[:16]
         if self.exr is not None:
             found["ocio"] = sha256(self.color_target().contents.encode()).hexdigest()[:16]
         return found
 
-    def write_template(self, path: Path, performance: Performance, frames: Sequence[int]) -> None:
+    def write_template(self, path: Path, driven: DrivenAvatar, frames: Sequence[int]) -> None:
         """Write the farm's job."""
-        from dsar.drafts import write_whole
+        from dsar.atomic_files import write_text_atomically
         from dsar.training.checkpoint import Run, read_config
         from dsar_render import openjd_template
 
         if self.mp4 is not None:
             raise ConfigError("--mp4: a farm's task has some frames, a video all of them; leave --mp4 out")
         run = Run(self.chosen_run())
-        kept = run.scene.exists() or read_config(run).capture == EMBEDDED
-        if not kept and not (self.motion_file() and self.cameras):
+        describe_remains = run.scene.exists() or read_config(run).capture == EMBEDDED
+        if not describe_remains and not (self.motion_file() and self.cameras):
             LOGGER.warning(
                 "Run %s is older and keeps no cameras and motions: the farm's machines need its capture",
                 run.folder,
             )
-        command = ["dsar", "render", *self.arguments(), "--expect", to_flag(self.inputs(performance))]
-        write_whole(path, openjd_template(self.name, command, frames, chunk=self.chunk))
+        command = ["dsar", "render", *self.arguments(), "--expect", to_flag(self.inputs(driven))]
+        write_text_atomically(path, openjd_template(self.name, command, frames, chunk=self.chunk))
 
     def arguments(self) -> list[str]:
         """Return the arguments that make this command, but for which frames, with absolute paths."""

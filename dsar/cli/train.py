@@ -7,10 +7,10 @@ from typing import Literal
 
 import tyro
 
-from dsar.cli.common import Common
+from dsar.cli.command import Common
 from dsar.cli.previews import write_previews
 from dsar.config import PRESETS, AtlasConfig, LossConfig, ModelConfig, ScheduleConfig, TrainConfig
-from dsar.console import Bar
+from dsar.console import ProgressBar
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class Train(Common):
             schedule=schedule,
         )
 
-    def folders(self) -> list[Path]:
+    def output_folders(self) -> list[Path]:
         """Return the run's folder."""
         return [self.folder]
 
@@ -83,7 +83,7 @@ class Train(Common):
         """The run's folder."""
         return self.out or Path("runs") / self.preset
 
-    def kept(self) -> str:
+    def describe_remains(self) -> str:
         """Return up to where training is saved."""
         from dsar.training.checkpoint import Run, read_progress
 
@@ -95,8 +95,8 @@ class Train(Common):
 
     def run(self) -> None:
         """Train, then leave pictures and a report."""
-        from dsar.data.capture import capture_of
-        from dsar.evaluation.check import refuse_at_a_glance
+        from dsar.data.captures.formats import capture_of
+        from dsar.evaluation.check import refuse_unusable_images
         from dsar.training.checkpoint import Run, read_progress
         from dsar.training.loop import train
         from dsar.training.report import Report
@@ -104,9 +104,9 @@ class Train(Common):
         self.check_device()
         run, config = Run(self.folder), self.config()
         if not run.checkpoint.exists():
-            refuse_at_a_glance(capture_of(config).with_cameras(config.cameras))
+            refuse_unusable_images(capture_of(config).with_cameras(config.cameras))
         last: list[Report] = []
-        with Bar(self.progress, "train").running() as bar:
+        with ProgressBar(self.progress, "train").running() as bar:
 
             def report(line: Report) -> None:
                 last[:] = [line]

@@ -26,12 +26,12 @@ _I3D_SIDE = 224
 _SLICE_SIZE = (64, 224)
 """Pixels of a slice in time and in space, as the network sees it."""
 
-Film = UInt8[np.ndarray, "f h w 3"]
+Video = UInt8[np.ndarray, "f h w 3"]
 
 
-def slice_features(film: Film, network: Lpips) -> Float[Tensor, "c 512"]:
+def slice_features(video: Video, network: Lpips) -> Float[Tensor, "c 512"]:
     """Return a vector for each clip of a film: AlexNet's last features, means over x-t and y-t slices."""
-    return torch.stack([_slices_of(clip, network) for clip in _clips(film)])
+    return torch.stack([_slices_of(clip, network) for clip in _clips(video)])
 
 
 @torch.no_grad()
@@ -70,10 +70,10 @@ def load_i3d() -> nn.Module | None:
 
 
 @torch.no_grad()
-def i3d_features(film: Film, network: nn.Module) -> Float[Tensor, "c d"]:
+def i3d_features(video: Video, network: nn.Module) -> Float[Tensor, "c d"]:
     """Return I3D's features of each clip of a film, seen at 224x224."""
     found = []
-    for clip in _clips(film):
+    for clip in _clips(video):
         size = (_I3D_SIDE, _I3D_SIDE)
         frames = nn.functional.interpolate(clip.movedim(-1, 1), size, mode="bilinear", antialias=True)
         seen = (2 * frames - 1).movedim(1, 0)[None]
@@ -81,9 +81,9 @@ def i3d_features(film: Film, network: nn.Module) -> Float[Tensor, "c d"]:
     return torch.stack(found)
 
 
-def _clips(film: Film) -> list[Float[Tensor, "t h w 3"]]:
-    starts = range(0, len(film) - CLIP + 1, STRIDE)
-    return [torch.from_numpy(film[start : start + CLIP]).float() / 255 for start in starts]
+def _clips(video: Video) -> list[Float[Tensor, "t h w 3"]]:
+    starts = range(0, len(video) - CLIP + 1, STRIDE)
+    return [torch.from_numpy(video[start : start + CLIP]).float() / 255 for start in starts]
 
 
 def frechet_distance(made: Float[Tensor, "a d"], true: Float[Tensor, "b d"]) -> float:

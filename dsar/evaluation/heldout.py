@@ -16,16 +16,16 @@ from torch import Tensor
 
 from dsar.avatar.avatar import Avatar
 from dsar.avatar.rollout import START_FRAME, roll_out
-from dsar.data.divergence import divergence
-from dsar.data.multiview import MultiViewCapture
-from dsar.evaluation.films import FILM_METRICS, evaluate_films
-from dsar.evaluation.garment import garment_mask, measure_garment
-from dsar.evaluation.metrics import ImageMetric, correlation, load_perceptual, psnr
-from dsar.evaluation.parts import read_clock, time_parts
-from dsar.evaluation.temporal import temporal_psnr, trace_back, warp_error
+from dsar.data.captures.multiview import MultiViewCapture
+from dsar.data.motions.mmd import motion_mmd
+from dsar.evaluation.garment_metrics import garment_mask, measure_garment
+from dsar.evaluation.image_metrics import ImageMetric, correlation, load_perceptual, psnr
+from dsar.evaluation.profiling import read_clock, time_stages
+from dsar.evaluation.temporal_metrics import temporal_psnr, trace_back, warp_error
+from dsar.evaluation.videos import VIDEO_METRICS, evaluate_videos
 from dsar.evaluation.views import WHITE, View, render_white, true_view
 from dsar.network import STREAMS, Stream
-from dsar.network.streaming import Rollout
+from dsar.network.session import InferenceSession
 from dsar.raster import rasterize
 from dsar.training.losses import ssim
 from dsar.training.targets import mask_box
@@ -67,14 +67,14 @@ def evaluate_sequence(
     16th those that take longest.
     """
     motion = capture.motions[sequence]
-    track = avatar.track(motion)
-    cloth = true_garment(capture, sequence)
+    signal = avatar.driving_signal(motion)
+    cloth = garment_ground_truth(capture, sequence)
     rows, before = [], None
     for number, gaussians in roll_out(avatar, motion, streams=streams):
         frame = number - START_FRAME
         if frame % stride == 0:
-            template = avatar.gaussians(track[[frame]], None)[0]
-            for index in capture.seen_by(sequence, frame):
+            template = avatar.gaussians(signal[[frame]], None)[0]
+            for index in capture.cameras_with_image(sequence, frame):
                 camera, truth = capture.cameras[index], true_view(capture, sequence, frame, index)
                 image = render_white(gaussians, camera)
                 row: dict[str, float | int] = {"frame": frame, "camera": index}
@@ -84,7 +84,7 @@ def evaluate_sequence(
                     if dressed.any():
                         row["psnr_garment"] = psnr(image[dressed][None], truth.color[dressed][None])
                 seldom = frame % (_SELDOM * stride) == 0
-                if seldom and before is not None and index in capture.seen_by(sequence, frame - 1):
+                if seldom and before is not None and index in capture.cameras_with_image(sequence, frame - 1):
                     last = true_view(capture, sequence, frame - 1, index)
                     row |= compare_change((before, gaussians), camera, (last, truth), perceptual)
                     # The first frame has none before it.
@@ -96,7 +96,7 @@ def evaluate_sequence(
     return rows
 
 
-def true_garment(capture: Capture, sequence: str) -> tuple[Tensor, Tensor] | None:
+def garment_ground_truth(capture: Capture, sequence: str) -> tuple[Tensor, Tensor] | None:
     """Return the garment's true vertices [f,v,3] and triangles [t,3]; None where the capture has none."""
     if not (isinstance(capture, MultiViewCapture) and capture.garment_runs(sequence)):
         return None
@@ -153,7 +153,7 @@ def one_to_many(
             for number, gaussians in roll_out(avatar, capture.motions[pair.sequence], streams=streams)
             if number - START_FRAME in frames
         }
-        seen = set.intersection(*(set(capture.seen_by(pair.sequence, frame)) for frame in frames))
+        seen = set.intersection(*(set(capture.cameras_with_image(pair.sequence, frame)) for frame in frames))
         for index in sorted(seen):
             camera = capture.cameras[index]
             still, still_image = (
@@ -180,18 +180,18 @@ def time_rollout(
     Medians, and what 95 of 100 frames stay below; the first frames are left out. Posing includes the input
     maps, which are posed control points.
     """
-    track = avatar.track(capture.motions[sequence])
-    rollout = Rollout(avatar.network)
+    signal = avatar.driving_signal(capture.motions[sequence])
+    session = InferenceSession(avatar.network)
     times: dict[str, list[float]] = defaultdict(list)
     for frame in range(_WARM_UP + frames):
         start = read_clock()
-        context = track[[frame % len(track)]]
-        maps, magnitude = avatar.standardized(avatar.maps(context, avatar.fps))
+        motion_window = signal[[frame % len(signal)]]
+        maps, magnitude = avatar.standardize(avatar.input_maps(motion_window, avatar.fps))
         seen = read_clock()
-        step = partial(rollout.step, maps, magnitude)
-        output, parts = time_parts(rollout.network, step)
+        step = partial(session.step, maps, magnitude)
+        output, parts = time_stages(session.network, step)
         made = read_clock()
-        gaussians = avatar.gaussians(context, output)[0]
+        gaussians = avatar.gaussians(motion_window, output)[0]
         posed = read_clock()
         render_white(gaussians, capture.cameras[0])
         parts |= {"pose": 1e3 * (seen - start + posed - made), "raster": 1e3 * (read_clock() - posed)}
@@ -230,18 +230,18 @@ def evaluate(
         skipped["tlpips"] = skipped["lpips"]
     heldout = {split: list(capture.splits.get(split, ())) for split in ("test", "nd", "fd")}
     heldout = {split: names for split, names in heldout.items() if names}
-    films, missing = evaluate_films(avatar, capture, heldout, streams)
+    videos, missing = evaluate_videos(avatar, capture, heldout, streams)
     skipped |= missing
     for split in ("train", "test", "nd", "fd"):
         names = [name for name in capture.splits.get(split, ()) if name in by_sequence]
         rows = summarize(by_sequence, names, len(capture.cameras)) if names else None
         if rows:
             rows["mmd"] = (
-                divergence(capture.motions, capture.splits["train"], names) if split != "train" else 0.0
+                motion_mmd(capture.motions, capture.splits["train"], names) if split != "train" else 0.0
             )
-        splits[split] = rows and rows | dict.fromkeys(FILM_METRICS) | films.get(split, {})
+        splits[split] = rows and rows | dict.fromkeys(VIDEO_METRICS) | videos.get(split, {})
     garments = {name: measure_garment(avatar, capture, name, 2 * stride) for name in capture.splits["test"]}
-    if not all(true_garment(capture, name) for name in by_sequence):
+    if not all(garment_ground_truth(capture, name) for name in by_sequence):
         skipped["psnr_garment"] = "the capture does not say where the garment is"
     if not all(garments.values()):
         skipped["garment"] = "no simulated garment in the capture, or no garment chart in the avatar"

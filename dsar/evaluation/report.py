@@ -16,15 +16,15 @@ import plotly.graph_objects as go
 from jinja2 import Environment, StrictUndefined
 from plotly.offline import get_plotlyjs
 
+from dsar.atomic_files import write_text_atomically
 from dsar.config import PRESETS, TrainConfig, absolute_capture, config_to_json
-from dsar.drafts import write_whole
-from dsar.evaluation.study.chart import QUALITIES, interactive_chart, points_of, times_of
+from dsar.evaluation.study.chart import QUALITIES, chart_points, interactive_chart, training_time_series
 from dsar.evaluation.study.summary import table_cells
 from dsar.training.checkpoint import Run, read_config, read_json, read_progress
 
 LOGGER = logging.getLogger(__name__)
 
-_STAGES = {"template": "#9aa5b1", "imitation": "#c77d0a", "pose": "#4c78a8", "autoregressive": "#2a7f62"}
+_STAGES = {"template": "#9aa5b1", "pretraining": "#c77d0a", "pose": "#4c78a8", "autoregressive": "#2a7f62"}
 _METRICS = (
     *("psnr", "psnr_box", "psnr_box_template", "psnr_garment", "ssim", "lpips", "lpips_vgg", "flip"),
     *("tpsnr", "warp_error", "vmaf", "mmd"),
@@ -75,7 +75,7 @@ def write_report(run: Run) -> Path:
     engine = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
     engine.filters["figure"] = _figure
     source = Path(__file__).with_name("report.html.jinja").read_text()
-    write_whole(run.report, engine.from_string(source).render(facts))
+    write_text_atomically(run.report, engine.from_string(source).render(facts))
     return run.report
 
 
@@ -106,7 +106,7 @@ def _draw_stability(battery: Mapping[str, Any]) -> str:
 def _draw_study(summary: Mapping[str, Any], figures: Mapping[str, Any] | None) -> Iterator[str]:
     """Return the study's models, speed against accuracy, and this run among them once it is measured."""
     for quality in QUALITIES:
-        figure = interactive_chart(points_of(summary), quality)
+        figure = interactive_chart(chart_points(summary), quality)
         if figures is not None:
             far = figures["splits"]["fd"] or figures["splits"]["test"]
             place = {"x": [1000 / figures["fps"]], "y": [far[quality]]}
@@ -116,7 +116,7 @@ def _draw_study(summary: Mapping[str, Any], figures: Mapping[str, Any] | None) -
         figure.update_xaxes(type="log")
         yield _draw(figure, "milliseconds a frame", quality, log=False)
     figure = go.Figure()
-    for label, line in times_of(summary).items():
+    for label, line in training_time_series(summary).items():
         minutes, psnr = zip(*line, strict=True)
         figure.add_scatter(x=minutes, y=psnr, name=label)
     if figure.data:
@@ -129,7 +129,7 @@ def _draw_curves(lines: list[dict[str, Any]]) -> Iterator[str]:
         for stage, colour in _STAGES.items():
             part = [line for line in lines if line["stage"] == stage]
             # Imitation sees no images.
-            if part and (key, stage) != ("psnr", "imitation"):
+            if part and (key, stage) != ("psnr", "pretraining"):
                 steps, values = [line["step"] for line in part], [line[key] for line in part]
                 figure.add_scatter(x=steps, y=values, name=stage, line_color=colour)
         yield _draw(figure, "update", label, log=key == "loss")

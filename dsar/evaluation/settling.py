@@ -9,7 +9,7 @@ def rms_speeds(points: Float[Tensor, "f p 3"], fps: float) -> Float[Tensor, " g"
     return points.diff(dim=0).mul(fps).square().sum(-1).mean(-1).sqrt()
 
 
-def settle_time(speeds: Float[Tensor, " g"], start: int, end: int, slow: float, fps: float) -> float:
+def settling_time(speeds: Float[Tensor, " g"], start: int, end: int, slow: float, fps: float) -> float:
     """Return the seconds from frame `start` until speeds stay below `slow` up to frame `end`.
 
     A garment that is still faster at the end has not settled: the whole stretch counts.

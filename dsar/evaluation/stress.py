@@ -16,21 +16,21 @@ from torch import Tensor
 
 from dsar.avatar.avatar import Avatar
 from dsar.avatar.rollout import network_outputs
-from dsar.data.motion import resample
-from dsar.evaluation.drills import spin_and_stop, swaying, swerving, teleported
-from dsar.evaluation.horizon import looped
+from dsar.data.motions.files import resample
+from dsar.evaluation.looping import loop_motion
+from dsar.evaluation.stress_motions import change_future, spin_and_stop, sway_motion, teleport_motion
 from dsar.network import NetworkOutput
 from dsar.types import Motion
 
 _MILLIMETRES = 1000.0
 _NOISE = 0.02
 """Metres, rms, by which a twin's previous offsets are wrong."""
-_PRESENT = 0.05
+_MOVING_SHARE = 0.05
 """Share of its speed in the spin that cloth must keep a fifth of a second after the stop."""
 
 
 @dataclass(frozen=True)
-class Verdict:
+class CaseVerdict:
     """What a case found."""
 
     value: float
@@ -62,31 +62,31 @@ class Verdict:
         return verdict | {"present": self.present, "curve": curve}
 
 
-Case = Callable[[Avatar, Motion], Verdict]
+Case = Callable[[Avatar, Motion], CaseVerdict]
 
 
-def run_long(avatar: Avatar, motion: Motion, frames: int = 10_000) -> Verdict:
+def run_long(avatar: Avatar, motion: Motion, frames: int = 10_000) -> CaseVerdict:
     """A motion repeated for `frames` frames: change of the mean offset per 1000 frames, over its mean.
 
     Its slope is that of a line through the means of rounds; the curve is these means, mm.
     """
-    _, period = looped(motion, 1)
+    _, period = loop_motion(motion, 1)
     rounds = max(3, -(-frames // period))
     sizes = torch.stack(
-        [offset.norm(dim=-1).mean() for offset in _offsets(avatar, looped(motion, rounds)[0])]
+        [offset.norm(dim=-1).mean() for offset in _offsets(avatar, loop_motion(motion, rounds)[0])]
     )
     means = sizes.reshape(rounds, period).mean(1).double()
     centred = torch.arange(rounds) - (rounds - 1) / 2
     slope = (centred * means).sum() / centred.square().sum() * (1000 / period) / means.mean().clamp_min(1e-9)
-    return Verdict(_finite(slope.abs()), 0.01, "per 1000 frames", _curve(means * _MILLIMETRES))
+    return CaseVerdict(_finite(slope.abs()), 0.01, "per 1000 frames", _curve(means * _MILLIMETRES))
 
 
-def run_cycle(avatar: Avatar, motion: Motion, cycles: int = 100) -> Verdict:
+def run_cycle(avatar: Avatar, motion: Motion, cycles: int = 100) -> CaseVerdict:
     """A pose that turns to and fro: rms difference of a cycle from the one before it, median from the 5th on.
 
     The curve is that difference, cycle by cycle, mm.
     """
-    sway, period = swaying(motion, cycles)
+    sway, period = sway_motion(motion, cycles)
     last: deque[Tensor] = deque(maxlen=period)
     distances = []
     for offset in _offsets(avatar, sway):
@@ -94,46 +94,46 @@ def run_cycle(avatar: Avatar, motion: Motion, cycles: int = 100) -> Verdict:
             distances.append(_distance(offset, last[0]))
         last.append(offset)
     apart = torch.stack(distances).reshape(cycles - 1, period).square().mean(1).sqrt()
-    return Verdict(_finite(apart[4:].median()), 0.5, "mm", _curve(apart))
+    return CaseVerdict(_finite(apart[4:].median()), 0.5, "mm", _curve(apart))
 
 
 @torch.no_grad()
-def run_twin(avatar: Avatar, motion: Motion, start: int = 30) -> Verdict:
+def run_twin(avatar: Avatar, motion: Motion, start: int = 30) -> CaseVerdict:
     """Two rollouts, one of which is put wrong at a frame: seconds until they are 1 mm (rms) apart for good.
 
     It is given a bank of noise and offsets that are 2 cm (rms) wrong. The curve is their distance, mm.
     """
-    long, _ = looped(motion, 3)
-    track, generator = avatar.track(long), torch.Generator().manual_seed(0)
-    state, apart = avatar.start(2), []
-    for frame in range(len(track)):
+    long, _ = loop_motion(motion, 3)
+    signal, generator = avatar.driving_signal(long), torch.Generator().manual_seed(0)
+    state, apart = avatar.initial_state(2), []
+    for frame in range(len(signal)):
         if frame == start:
             state = state.map(torch.clone)
             memory, offsets = state.memory[1], state.offsets[1]
             memory.copy_(torch.randn(memory.shape, generator=generator) * memory.square().mean().sqrt())
             offsets.add_(_NOISE * torch.randn(offsets.shape, generator=generator))
-        context = track[[frame]]
-        output, state, _ = avatar.advance(context.expand(2, -1, -1, -1, -1), state)
+        motion_window = signal[[frame]]
+        output, state, _ = avatar.forward_frame(motion_window.expand(2, -1, -1, -1, -1), state)
         if frame >= start:
             apart.append(_distance(*_at_control_points(avatar, output)))
     distances = torch.stack(apart)
     wrong = (~(distances < 1.0)).nonzero()
     seconds = torch.tensor((int(wrong[-1]) + 1) / avatar.fps if len(wrong) else 0.0)
-    return Verdict(_finite(seconds, distances), 3.0, "s", _curve(distances))
+    return CaseVerdict(_finite(seconds, distances), 3.0, "s", _curve(distances))
 
 
-def run_teleport(avatar: Avatar, motion: Motion) -> Verdict:
+def run_teleport(avatar: Avatar, motion: Motion) -> CaseVerdict:
     """A body that appears 10 m away and turned about in mid-motion: largest change of any offset.
 
     The curve is the largest change frame by frame, mm.
     """
-    there = teleported(motion, avatar.body, len(motion) // 2)
+    there = teleport_motion(motion, avatar.body, len(motion) // 2)
     pairs = zip(_offsets(avatar, motion), _offsets(avatar, there), strict=True)
     apart = torch.stack([(one - other).norm(dim=-1).amax() for one, other in pairs]) * _MILLIMETRES
-    return Verdict(_finite(apart.amax()), 0.1, "mm", _curve(apart))
+    return CaseVerdict(_finite(apart.amax()), 0.1, "mm", _curve(apart))
 
 
-def run_stop(avatar: Avatar, motion: Motion) -> Verdict:
+def run_stop(avatar: Avatar, motion: Motion) -> CaseVerdict:
     """A spin that stops at once: rms distance from where the cloth ends up, 3 seconds later.
 
     After a fifth of a second it must still move at 5 % of its mean speed in the spin, or memory is not
@@ -143,12 +143,12 @@ def run_stop(avatar: Avatar, motion: Motion) -> Verdict:
     offsets = torch.stack(list(_offsets(avatar, spin)))
     speeds = _distance(offsets[1:], offsets[:-1])
     residual = _distance(offsets[stop:], offsets[-1:].expand_as(offsets[stop:]))
-    present = bool(speeds[stop + round(0.2 * avatar.fps)] > _PRESENT * speeds[:stop].mean())
+    present = bool(speeds[stop + round(0.2 * avatar.fps)] > _MOVING_SHARE * speeds[:stop].mean())
     late = residual[round(3 * avatar.fps) :].amax()
-    return Verdict(_finite(late), 1.0, "mm", _curve(residual), present)
+    return CaseVerdict(_finite(late), 1.0, "mm", _curve(residual), present)
 
 
-def run_rate(avatar: Avatar, motion: Motion) -> Verdict:
+def run_rate(avatar: Avatar, motion: Motion) -> CaseVerdict:
     """The same motion at 15, 60 and 120 frames a second, resampled to the avatar's: largest rms difference.
 
     The curve is the difference at each of these rates, mm.
@@ -160,18 +160,18 @@ def run_rate(avatar: Avatar, motion: Motion) -> Verdict:
         other = torch.stack(list(_offsets(avatar, there)))
         apart.append(_distance(exact[: len(other)], other).square().mean().sqrt())
     distances = torch.stack(apart)
-    return Verdict(_finite(distances.amax()), 2.0, "mm", _curve(distances))
+    return CaseVerdict(_finite(distances.amax()), 2.0, "mm", _curve(distances))
 
 
-def run_causal(avatar: Avatar, motion: Motion) -> Verdict:
+def run_causal(avatar: Avatar, motion: Motion) -> CaseVerdict:
     """Two futures of one past: largest difference before they part.
 
     The curve is the largest difference frame by frame, mm.
     """
     part = len(motion) // 2
-    pairs = zip(_offsets(avatar, motion), _offsets(avatar, swerving(motion, part)), strict=True)
+    pairs = zip(_offsets(avatar, motion), _offsets(avatar, change_future(motion, part)), strict=True)
     apart = torch.stack([(one - other).abs().amax() for one, other in pairs]) * _MILLIMETRES
-    return Verdict(
+    return CaseVerdict(
         _finite(apart[:part].amax()), 0.0, "mm", _curve(apart), present=bool(apart[part:].amax() > 0)
     )
 
@@ -190,7 +190,7 @@ CASES: Mapping[str, Case] = {
 @torch.no_grad()
 def stress(
     avatar: Avatar, motion: Motion, cases: Mapping[str, Case] = CASES
-) -> Iterator[tuple[str, Verdict]]:
+) -> Iterator[tuple[str, CaseVerdict]]:
     """Yield the verdict of each case on a motion at the avatar's frame rate."""
     for name, case in cases.items():
         yield name, case(avatar, motion)
@@ -202,7 +202,7 @@ def _offsets(avatar: Avatar, motion: Motion) -> Iterator[Float[Tensor, "p 3"]]:
 
 
 def _at_control_points(avatar: Avatar, output: NetworkOutput) -> Float[Tensor, "b p 3"]:
-    return output.offset.flatten(2)[:, :, avatar.cells].transpose(1, 2)
+    return output.offset.flatten(2)[:, :, avatar.control_cells].transpose(1, 2)
 
 
 def _distance(one: Float[Tensor, "*s p 3"], other: Float[Tensor, "*s p 3"]) -> Float[Tensor, "*s"]:

@@ -12,10 +12,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dsar.drafts import replacing
+from dsar.atomic_files import atomic_write
 from dsar.errors import ConfigError
-from dsar.geometry.paths import START_FRAME, CameraPath
-from dsar.geometry.rates import exact_rate, same_rate
+from dsar.geometry.camera_paths import START_FRAME, CameraPath
+from dsar.geometry.frame_rates import exact_rate, same_rate
 from dsar.text import read_json
 from dsar.types import Camera
 
@@ -107,7 +107,7 @@ def write_cameras_json(paths: Sequence[CameraPath], path: Path) -> Path:
     for name in names:
         _checked_name(name, str(path))
     _refuse_doubled(names, str(path))
-    with replacing(path) as draft:
+    with atomic_write(path) as draft:
         draft.write_text(cameras_to_json(paths))
     return path
 

@@ -38,7 +38,7 @@ def unproject(
     return (local - transform[:3, 3]) @ transform[:3, :3]
 
 
-def spread_out(cameras: Sequence[Camera], count: int) -> list[Camera]:
+def farthest_cameras(cameras: Sequence[Camera], count: int) -> list[Camera]:
     """Return some cameras in their order: the first, and others as far from those chosen as can be."""
     transforms = torch.stack([camera.T_camera_world for camera in cameras])
     centers = -(transforms[:, :3, :3].mT @ transforms[:, :3, 3:])[..., 0]

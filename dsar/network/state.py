@@ -51,7 +51,7 @@ class NetworkState:
         )
 
 
-def repeat_where(
+def fill_where_fresh(
     fresh: Bool[Tensor, " b"], newest: Float[Tensor, "b *s"], ring: Float[Tensor, "b n *s"]
 ) -> Float[Tensor, "b n *s"]:
     """Return the ring, or copies of the newest entry for rollouts that have no history yet."""
@@ -66,5 +66,5 @@ def push(
 ) -> Float[Tensor, "b n c h w"]:
     """Drop the oldest entry of a ring and append the newest; without history it fills the ring."""
     newest = newest.movedim(1, -1)
-    history = repeat_where(fresh, newest, ring.movedim(2, -1))
+    history = fill_where_fresh(fresh, newest, ring.movedim(2, -1))
     return torch.cat([history[:, 1:], newest[:, None]], 1).movedim(-1, 2)

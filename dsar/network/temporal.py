@@ -41,22 +41,25 @@ class TemporalAttention(nn.Module):
         self.key = projection(channels, channels)
         self.value = projection(channels, channels)
         self.out = projection(channels, channels)
-        self.age = nn.Parameter(0.02 * torch.randn(length, channels))
+        self.position_embedding = nn.Parameter(0.02 * torch.randn(length, channels))
         self._frozen: tuple[Tensor, Tensor] | None = None
 
     def freeze(self) -> None:
         """Join the weights of keys and values once and for all: they no longer change."""
-        self._frozen = self._keys_and_values()
+        self._frozen = self._key_value_weights()
 
-    def project(self, frames: Float[Tensor, "b n c h w"]) -> Float[Tensor, "b n h w _"]:
+    def project_keys_values(self, frames: Float[Tensor, "b n c h w"]) -> Float[Tensor, "b n h w _"]:
         """Return keys and values of frames side by side, without their ages."""
-        return linear(frames.movedim(2, -1), *self._keys_and_values())
+        return linear(frames.movedim(2, -1), *self._key_value_weights())
 
-    def ages(self, order: Int64[Tensor, "*p n"] | None = None) -> Float[Tensor, "*p n d"]:
+    def position_bias(self, order: Int64[Tensor, "*p n"] | None = None) -> Float[Tensor, "*p n d"]:
         """Return what their ages add to the keys and values of frames."""
-        return linear(self.age if order is None else self.age[order], self._keys_and_values()[0])
+        return linear(
+            self.position_embedding if order is None else self.position_embedding[order],
+            self._key_value_weights()[0],
+        )
 
-    def _keys_and_values(self) -> tuple[Float[Tensor, "d c"], Float[Tensor, " d"]]:
+    def _key_value_weights(self) -> tuple[Float[Tensor, "d c"], Float[Tensor, " d"]]:
         """Return the weights and the bias of both, one above the other; keys have the scores' scale."""
         if self._frozen is not None:
             return self._frozen
@@ -69,26 +72,30 @@ class TemporalAttention(nn.Module):
     def attend(
         self,
         queries: Float[Tensor, "b q c h w"],
-        frames: Float[Tensor, "b n h w d"],
-        ages: Float[Tensor, "n d"],
+        key_values: Float[Tensor, "b n h w d"],
+        position_bias: Float[Tensor, "n d"],
         *,
-        common: Float[Tensor, "b c h w"] | None = None,
-        younger: Bool[Tensor, "q n"] | None = None,
+        offset_features: Float[Tensor, "b c h w"] | None = None,
+        future_mask: Bool[Tensor, "q n"] | None = None,
     ) -> Float[Tensor, "b q c h w"]:
-        """Return what each query finds among frames given by `project` and `ages`.
+        """Return what each query finds among frames given by `project_keys_values` and `position_bias`.
 
-        `common` was to be added to every frame before they were projected. What is `younger` than a query is
-        hidden from it.
+        `offset_features` were to be added to every frame before they were projected. Entries of
+        `future_mask` are hidden from a query.
         """
-        late = ages[:, None, None]
-        if common is not None:
-            late = late + linear(common.movedim(1, -1), self._keys_and_values()[0])[:, None]
-        b, n, h, w, _ = frames.shape
-        keys, values = (frames + late).view(b, 1, n, h, w, 2, self.heads, -1).unbind(-3)
-        asked = per_pixel(self.query, queries.movedim(2, -1)).view(b, -1, 1, h, w, self.heads, keys.shape[-1])
-        scores = (asked * keys).sum(-1, keepdim=True)
-        if younger is not None:
-            scores = scores.masked_fill(younger[:, :, None, None, None, None], -torch.inf)
+        key_value_bias = position_bias[:, None, None]
+        if offset_features is not None:
+            key_value_bias = (
+                key_value_bias + linear(offset_features.movedim(1, -1), self._key_value_weights()[0])[:, None]
+            )
+        b, n, h, w, _ = key_values.shape
+        keys, values = (key_values + key_value_bias).view(b, 1, n, h, w, 2, self.heads, -1).unbind(-3)
+        projected_queries = per_pixel(self.query, queries.movedim(2, -1)).view(
+            b, -1, 1, h, w, self.heads, keys.shape[-1]
+        )
+        scores = (projected_queries * keys).sum(-1, keepdim=True)
+        if future_mask is not None:
+            scores = scores.masked_fill(future_mask[:, :, None, None, None, None], -torch.inf)
         mixed = (scores.softmax(2) * values).sum(2)
         return per_pixel(self.out, mixed.flatten(-2)).movedim(-1, 2)
 
@@ -96,26 +103,26 @@ class TemporalAttention(nn.Module):
 class MemoryBank(nn.Module):
     """Mix the aggregate of the window with what the bank recalls (paper equations 12-13)."""
 
-    def __init__(self, channels: int, heads: int, length: int, recall: float) -> None:
+    def __init__(self, channels: int, heads: int, length: int, memory_weight: float) -> None:
         super().__init__()
         self.attention = TemporalAttention(channels, heads, length)
-        self.recall_logit = nn.Parameter(torch.tensor(recall).logit())
+        self.memory_logit = nn.Parameter(torch.tensor(memory_weight).logit())
 
     def forward(
         self,
         aggregate: Float[Tensor, "b c h w"],
-        frames: Float[Tensor, "b m h w d"],
-        ages: Float[Tensor, "m d"],
+        key_values: Float[Tensor, "b m h w d"],
+        position_bias: Float[Tensor, "m d"],
     ) -> Float[Tensor, "b c h w"]:
-        """Return h = (1 - lambda) A + lambda CrossAttn(A, M), lambda = sigmoid(recall_logit).
+        """Return h = (1 - lambda) A + lambda CrossAttn(A, M), lambda = sigmoid(memory_logit).
 
-        `frames` and `ages` are the attention's own projections of the bank.
+        `key_values` and `position_bias` are the attention's own projections of the bank.
         """
-        recalled = self.attention.attend(aggregate[:, None], frames, ages)[:, 0]
-        return aggregate.lerp(recalled, self.recall_logit.sigmoid())
+        recalled = self.attention.attend(aggregate[:, None], key_values, position_bias)[:, 0]
+        return aggregate.lerp(recalled, self.memory_logit.sigmoid())
 
 
-class TemporalMixing(nn.Module):
+class TemporalAggregation(nn.Module):
     """Aggregate one shallow level over the window: a depthwise temporal filter, then 1x1 (equation 15)."""
 
     def __init__(self, channels: int, length: int) -> None:
@@ -129,7 +136,7 @@ class TemporalMixing(nn.Module):
     def forward(
         self,
         frames: Float[Tensor, "b n c h w"],
-        common: Float[Tensor, "b c h w"] | None,
+        offset_features: Float[Tensor, "b c h w"] | None,
         weights: Float[Tensor, "n c"],
     ) -> Float[Tensor, "b c h w"]:
         """Return the mixture of n frames, to each of which `common` is added.
@@ -137,6 +144,6 @@ class TemporalMixing(nn.Module):
         `weights` are this layer's, in the order of the frames.
         """
         mixed = (frames.movedim(2, -1) * weights[:, None, None]).sum(1)
-        if common is not None:
-            mixed = mixed + common.movedim(1, -1) * weights.sum(0)
+        if offset_features is not None:
+            mixed = mixed + offset_features.movedim(1, -1) * weights.sum(0)
         return per_pixel(self.mix, mixed).movedim(-1, 1)

@@ -15,7 +15,7 @@ from dsar.types import Camera, Gaussians, RenderOutput
 __all__ = ["Backend", "Output", "rasterize", "reduced_dilation"]
 
 Backend = Literal["auto", "cpu", "cuda", "reference"]
-Output = Literal["median_depth", "front_depth", "heaviest", "contributors"]
+Output = Literal["median_depth", "first_hit_depth", "largest_weight_id", "contributors"]
 
 
 def rasterize(

@@ -7,7 +7,7 @@ from torch import Tensor
 from dsar.types import Contributors
 
 
-def find_front_depth(contributors: Contributors, depths: Float[Tensor, " n"]) -> Float[Tensor, "h w"]:
+def find_first_hit_depth(contributors: Contributors, depths: Float[Tensor, " n"]) -> Float[Tensor, "h w"]:
     """Return the depth of each pixel's first Gaussian, 0 where there is none.
 
     Args:
@@ -21,7 +21,7 @@ def find_front_depth(contributors: Contributors, depths: Float[Tensor, " n"]) ->
     return found.view(contributors.counts.shape)
 
 
-def find_heaviest(contributors: Contributors) -> Int[Tensor, "h w"]:
+def find_largest_weight_id(contributors: Contributors) -> Int[Tensor, "h w"]:
     """Return the Gaussian with each pixel's largest share, the foremost of equals, -1 where there is none."""
     counts = contributors.counts.flatten()
     pixels = torch.arange(len(counts), device=counts.device).repeat_interleave(counts)

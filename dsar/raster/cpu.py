@@ -22,13 +22,13 @@ from dsar.errors import RasterError
 from dsar.raster.conventions import EPS_2D
 from dsar.raster.kernels_binning import (
     FIRST_ROWS,
-    count_pairs_part,
-    deal_pairs_part,
-    gather_sums_part,
-    place_pairs,
+    count_intersections_part,
+    emit_intersections_part,
+    prefix_sum,
+    reduce_sums_part,
     sort_by_depth,
 )
-from dsar.raster.kernels_compositing import composite_backward_part, composite_part, survey_part
+from dsar.raster.kernels_compositing import composite_auxiliary_part, composite_backward_part, composite_part
 from dsar.raster.kernels_projection import project_backward_part, project_part
 from dsar.raster.kernels_shading import shade_backward_part, shade_part
 from dsar.raster.parallel import part_count, run_parts
@@ -36,7 +36,7 @@ from dsar.raster.tiles import RECORD_SIZE, SUMS_SIZE, TILE
 from dsar.types import Camera, Contributors, Gaussians, RenderOutput
 
 _log = logging.getLogger(__name__)
-_MOST_PAIRS = 2**28
+_MAX_PAIRS = 2**28
 """Places are 32-bit, and a backward pass keeps 52 bytes a pair: this many would take 14 GB."""
 _NO_IMAGE = np.empty((0, 0), np.float32)
 _NO_COLOR = np.empty((0, 0, 3), np.float32)
@@ -69,9 +69,9 @@ class _Settings:
 def _apply(gaussians: Gaussians, background: Tensor | None, settings: _Settings) -> RenderOutput:
     fields = (getattr(gaussians, field.name) for field in dataclasses.fields(gaussians))
     images = _Rasterize.apply(*fields, background, settings)
-    color, alpha, depth, culled, median, front, heaviest, *found = images  # type: ignore[misc]  # untyped
+    color, alpha, depth, culled, median, first_hit, largest_id, *found = images  # type: ignore[misc]  # untyped
     contributors = Contributors(*found) if found[0] is not None else None
-    return RenderOutput(color, alpha, depth, culled, median, front, heaviest, contributors)
+    return RenderOutput(color, alpha, depth, culled, median, first_hit, largest_id, contributors)
 
 
 class _Rasterize(torch.autograd.Function):
@@ -86,15 +86,15 @@ class _Rasterize(torch.autograd.Function):
         view, center = _pack_camera(settings)
         records = _new_records(n)
         bounds = records.view(np.int32)[:, -4:]
-        run_parts(_prepare_part, *arrays, view, center, width, height, records, bounds)
+        run_parts(_project_and_shade_part, *arrays, view, center, width, height, records, bounds)
         tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
         order = sort_by_depth(records, bounds)
-        bins = _bin(order, records, bounds, tiles_x, tiles_y)
+        bins = _bin_into_tiles(order, records, bounds, tiles_x, tiles_y)
         outputs = torch.empty(height, width, 3), torch.empty(height, width), torch.empty(height, width)
         images = [output.numpy() for output in outputs]
         run_parts(composite_part, records, bins[0], bins[1], tiles_x, background, *images)
         culled = torch.tensor(n - len(order))
-        extras = _survey(records, bins[0], bins[1], tiles_x, settings)
+        extras = _auxiliary_pass(records, bins[0], bins[1], tiles_x, settings)
         ctx.mark_non_differentiable(culled, *(extra for extra in extras if extra is not None))
         ctx.save_for_backward(*tensors, *outputs)
         ctx.splats = records, bounds, view, center
@@ -107,19 +107,19 @@ class _Rasterize(torch.autograd.Function):
         *tensors, color, alpha, depth = ctx.saved_tensors
         arrays = [_as_array(tensor) for tensor in tensors[:5]]
         records, bounds, view, center = ctx.splats
-        tile_starts, pairs, splat_starts, places, tiles_x = ctx.bins
+        tile_offsets, pairs, splat_offsets, places, tiles_x = ctx.bins
         height, width = alpha.shape
         images = color.numpy(), alpha.numpy(), depth.numpy()
         v_images = map(_as_array, v_outputs[:3], (_NO_COLOR, _NO_IMAGE, _NO_IMAGE))
         pair_sums = np.empty((len(pairs), SUMS_SIZE), np.float32)
         run_parts(
-            composite_backward_part, records, tile_starts, pairs, tiles_x, *images, *v_images, pair_sums
+            composite_backward_part, records, tile_offsets, pairs, tiles_x, *images, *v_images, pair_sums
         )
         # Zeros from NumPy: torch would fill them with OpenMP threads, which then spin on the cores we need.
         gradients = [np.zeros(array.shape, np.float32) for array in arrays]
         sums = np.empty((len(bounds), SUMS_SIZE), np.float32)
-        run_parts(_finish_part, *arrays, view, center, width, height, bounds, splat_starts, places, pair_sums,
-                  sums, *gradients)  # fmt: skip
+        run_parts(_backward_part, *arrays, view, center, width, height, bounds, splat_offsets, places,
+                  pair_sums, sums, *gradients)  # fmt: skip
         v_background = None
         if ctx.needs_input_grad[5] and v_outputs[0] is not None:
             v_background = torch.einsum("hw,hwc->c", 1 - alpha, v_outputs[0])
@@ -137,65 +137,77 @@ def _new_records(count: int) -> np.ndarray:
     return lines[first : first + count * RECORD_SIZE].reshape(count, RECORD_SIZE)
 
 
-def _bin(
+def _bin_into_tiles(
     order: np.ndarray, records: np.ndarray, bounds: np.ndarray, tiles_x: int, tiles_y: int
 ) -> tuple[np.ndarray, ...]:
     """Return each tile's list of splats, front to back.
 
     Returns:
-        tile_starts: [tiles + 1] where each tile's list starts.
+        tile_offsets: [tiles + 1] where each tile's list starts.
         pairs: [p, 2] splat, and set of the tile's blocks that it touches.
-        splat_starts: [n + 1] where each splat's places start.
+        splat_offsets: [n + 1] where each splat's places start.
         places: [p] of each splat's pairs.
     """
     cursors = np.empty((part_count(), tiles_x * tiles_y), np.int32)
     tiles = np.zeros(len(bounds), np.int32)
-    run_parts(count_pairs_part, order, records, bounds, tiles_x, cursors, tiles)
+    run_parts(count_intersections_part, order, records, bounds, tiles_x, cursors, tiles)
     total = int(tiles.sum(dtype=np.int64))
-    if total > _MOST_PAIRS:
+    if total > _MAX_PAIRS:
         raise RasterError(
             f"rasterize: {len(order)} Gaussians cover {total} tiles of {TILE} x {TILE} pixels in all, more "
-            f"than the {_MOST_PAIRS} that can be listed; are scales in metres, and is the camera outside?"
+            f"than the {_MAX_PAIRS} that can be listed; are scales in metres, and is the camera outside?"
         )
-    tile_starts, splat_starts = place_pairs(cursors, tiles)
-    pairs, places = np.empty((tile_starts[-1], 2), np.int32), np.empty(tile_starts[-1], np.int32)
-    run_parts(deal_pairs_part, order, records, bounds, tiles_x, FIRST_ROWS, cursors, splat_starts,
+    tile_offsets, splat_offsets = prefix_sum(cursors, tiles)
+    pairs, places = np.empty((tile_offsets[-1], 2), np.int32), np.empty(tile_offsets[-1], np.int32)
+    run_parts(emit_intersections_part, order, records, bounds, tiles_x, FIRST_ROWS, cursors, splat_offsets,
               pairs, places)  # fmt: skip
-    return tile_starts, pairs, splat_starts, places
+    return tile_offsets, pairs, splat_offsets, places
 
 
-def _survey(
-    records: np.ndarray, tile_starts: np.ndarray, pairs: np.ndarray, tiles_x: int, settings: _Settings
+def _auxiliary_pass(
+    records: np.ndarray, tile_offsets: np.ndarray, pairs: np.ndarray, tiles_x: int, settings: _Settings
 ) -> tuple[Tensor | None, ...]:
-    """Return median and front depths, the heaviest splats, and the counts, ids and weights of contributors.
+    """Return median and front depths, the largest weight, and the counts, ids and weights of contributors.
 
     What is not wanted is None.
     """
     if not settings.outputs:
         return (None,) * 6
     width, height = settings.camera.width, settings.camera.height
-    medians, fronts = torch.empty(height, width), torch.empty(height, width)
-    heaviest, counts = (torch.empty(height, width, dtype=torch.int64) for _ in range(2))
+    medians, first_hits = torch.empty(height, width), torch.empty(height, width)
+    largest_id, counts = (torch.empty(height, width, dtype=torch.int64) for _ in range(2))
     ids, weights = torch.empty(0, dtype=torch.int64), torch.empty(0)
     starts = np.zeros(height * width, np.int64)
 
-    def survey() -> None:
-        run_parts(survey_part, records, tile_starts, pairs, tiles_x, starts, medians.numpy(), fronts.numpy(),
-                  heaviest.numpy(), counts.numpy(), ids.numpy(), weights.numpy())  # fmt: skip
+    def run_pass() -> None:
+        run_parts(
+            composite_auxiliary_part,
+            records,
+            tile_offsets,
+            pairs,
+            tiles_x,
+            starts,
+            medians.numpy(),
+            first_hits.numpy(),
+            largest_id.numpy(),
+            counts.numpy(),
+            ids.numpy(),
+            weights.numpy(),
+        )
 
-    survey()
-    images = {"median_depth": medians, "front_depth": fronts, "heaviest": heaviest}
+    run_pass()
+    images = {"median_depth": medians, "first_hit_depth": first_hits, "largest_weight_id": largest_id}
     wanted = tuple(image if name in settings.outputs else None for name, image in images.items())
     if "contributors" not in settings.outputs:
         return *wanted, None, None, None
     ends = counts.flatten().cumsum(0)
     starts = (ends - counts.flatten()).numpy()
     ids, weights = torch.empty(int(ends[-1]), dtype=torch.int64), torch.empty(int(ends[-1]))
-    survey()
+    run_pass()
     return *wanted, counts, ids, weights
 
 
-def _prepare_part(
+def _project_and_shade_part(
     part, parts, means, rotations, scales, opacities, harmonics,
     view, center, width, height, records, bounds,
 ):  # fmt: skip
@@ -204,13 +216,13 @@ def _prepare_part(
     shade_part(part, parts, means, harmonics, center, records, bounds)
 
 
-def _finish_part(
+def _backward_part(
     part, parts, means, rotations, scales, opacities, harmonics,
-    view, center, width, height, bounds, splat_starts, places, pair_sums, sums,
+    view, center, width, height, bounds, splat_offsets, places, pair_sums, sums,
     v_means, v_rotations, v_scales, v_opacities, v_harmonics,
 ):  # fmt: skip
     """Bring the gradients of one part's splats back to their Gaussians."""
-    gather_sums_part(part, parts, splat_starts, places, pair_sums, sums)
+    reduce_sums_part(part, parts, splat_offsets, places, pair_sums, sums)
     project_backward_part(part, parts, means, rotations, scales, opacities, view, width, height,
                           bounds, sums, v_means, v_rotations, v_scales, v_opacities)  # fmt: skip
     shade_backward_part(part, parts, means, harmonics, center, bounds, sums, v_harmonics, v_means)

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from dsar.errors import ConfigError, MissingDependencyError
-from dsar.raster.contributors import find_front_depth, find_heaviest
+from dsar.raster.contributors import find_first_hit_depth, find_largest_weight_id
 from dsar.raster.conventions import ALPHA_MAX, NEAR
 from dsar.raster.reference import rasterize_reference
 from dsar.types import Camera, Contributors, Gaussians, RenderOutput
@@ -38,7 +38,7 @@ def rasterize_cuda(
     if not len(gaussians):
         return rasterize_reference(gaussians, camera, background, dilation, antialiased, outputs)
     gsplat = _load_gsplat()
-    sound = _hide_unsound(gaussians)
+    sound = _hide_invalid(gaussians)
     image, alpha, meta = gsplat.rasterization(
         sound.means,
         sound.rotations,
@@ -66,8 +66,8 @@ def rasterize_cuda(
         depths = meta["depths"][0].detach()
         found = {
             "median_depth": lambda: _median_depth(contributors, before, depths),
-            "front_depth": lambda: find_front_depth(contributors, depths),
-            "heaviest": lambda: find_heaviest(contributors),
+            "first_hit_depth": lambda: find_first_hit_depth(contributors, depths),
+            "largest_weight_id": lambda: find_largest_weight_id(contributors),
             "contributors": lambda: contributors,
         }
         extras = {name: found[name]() for name in outputs}
@@ -95,7 +95,7 @@ def _load_gsplat() -> Any:
     return gsplat
 
 
-def _hide_unsound(gaussians: Gaussians) -> Gaussians:
+def _hide_invalid(gaussians: Gaussians) -> Gaussians:
     """Return the same Gaussians, those that cannot be drawn replaced by a transparent one.
 
     gsplat would blend what is not finite or has no size; were they taken out, the GPU would have to wait for

@@ -15,8 +15,17 @@ import numpy as np
 
 from dsar.raster.conventions import ALPHA_MIN
 from dsar.raster.jit import inlined, kernel
-from dsar.raster.simd import LANES, bits_of, larger, load, prefetch, smaller, spread, square_root
-from dsar.raster.tiles import AHEAD, BLOCK_HEIGHT, BLOCK_WIDTH, COLUMNS, RECORD_SIZE, STRIPS, TILE, TILE_BITS
+from dsar.raster.simd import LANES, broadcast, load, maximum, minimum, movemask, prefetch, sqrt
+from dsar.raster.tiles import (
+    BLOCK_HEIGHT,
+    BLOCK_WIDTH,
+    COLUMNS,
+    PREFETCH_DISTANCE,
+    RECORD_SIZE,
+    STRIPS,
+    TILE,
+    TILE_BITS,
+)
 
 FIRST_ROWS = np.array([BLOCK_HEIGHT * strip + 0.5 for strip in range(LANES)], np.float32)
 """Centre of each strip's first pixel row, from the tile's top; lanes beyond the last strip are not used."""
@@ -57,10 +66,10 @@ def sort_by_depth(records, bounds):
 
 
 @inlined
-def _fetch_ahead(records, order, k):
+def _prefetch_record(records, order, k):
     """Have the record of a splat that is due soon brought into the cache."""
-    if k + AHEAD < len(order):
-        prefetch(records, np.uint64(order[k + AHEAD]) * np.uint64(RECORD_SIZE))
+    if k + PREFETCH_DISTANCE < len(order):
+        prefetch(records, np.uint64(order[k + PREFETCH_DISTANCE]) * np.uint64(RECORD_SIZE))
 
 
 @inlined
@@ -76,12 +85,12 @@ def _tile_span(bounds, i):
 
 
 @kernel
-def count_pairs_part(part, parts, order, records, bounds, tiles_x, counts, tiles):
+def count_intersections_part(part, parts, order, records, bounds, tiles_x, counts, tiles):
     """Count the splats that one part will deal to every tile (counts[part]), and the tiles of each splat."""
     n, flat, counts = len(order), records.reshape(-1), counts[part]
     counts[:] = 0
     for k in range(n * part // parts, n * (part + 1) // parts):
-        _fetch_ahead(flat, order, k)
+        _prefetch_record(flat, order, k)
         i = np.uint64(order[k])
         x0, x1, y0, y1 = _tile_span(bounds, i)
         tiles[i] = (x1 - x0) * (y1 - y0)
@@ -91,26 +100,26 @@ def count_pairs_part(part, parts, order, records, bounds, tiles_x, counts, tiles
 
 
 @kernel
-def place_pairs(counts, tiles):
+def prefix_sum(counts, tiles):
     """Turn counts into where each part begins in each tile's list.
 
     Returns:
-        tile_starts: [tiles + 1] where each tile's pairs start.
-        splat_starts: [n + 1] where each splat's places start.
+        tile_offsets: [tiles + 1] where each tile's pairs start.
+        splat_offsets: [n + 1] where each splat's places start.
     """
-    tile_starts, splat_starts = np.empty(counts.shape[1] + 1, np.int32), np.empty(len(tiles) + 1, np.int32)
+    tile_offsets, splat_offsets = np.empty(counts.shape[1] + 1, np.int32), np.empty(len(tiles) + 1, np.int32)
     total = np.int32(0)
     for tile in range(counts.shape[1]):
-        tile_starts[tile] = total
+        tile_offsets[tile] = total
         for part in range(len(counts)):
             count = counts[part, tile]
             counts[part, tile] = total
             total += count
-    tile_starts[-1] = total
-    splat_starts[0] = 0
+    tile_offsets[-1] = total
+    splat_offsets[0] = 0
     for i in range(len(tiles)):
-        splat_starts[i + 1] = splat_starts[i] + tiles[i]
-    return tile_starts, splat_starts
+        splat_offsets[i + 1] = splat_offsets[i] + tiles[i]
+    return tile_offsets, splat_offsets
 
 
 @inlined
@@ -120,32 +129,32 @@ def _outline(records, i, top, first_rows):
     On the outline alpha is ALPHA_MIN: log2 opacity - e1² - e2² = log2 ALPHA_MIN. At dy = mean y - pixel y it
     spans dx = (shear dy ± sqrt(log2 (opacity / ALPHA_MIN) - e2²)) / stretch, most of all where dy is ± lift.
     """
-    height, limit, lift = records[i, 4], spread(records[i, 10]), spread(records[i, 11])
+    height, limit, lift = records[i, 4], broadcast(records[i, 10]), broadcast(records[i, 11])
     log_ratio, width = records[i, 5] - _LOG_ALPHA_MIN, np.float32(1) / records[i, 2]
     highest = records[i, 1] - top - load(first_rows, np.uint64(0))
     lowest = highest - np.float32(BLOCK_HEIGHT - 1)
     touched = (lowest - _SLACK <= limit) & (highest + _SLACK >= -limit)
-    low, high = larger(lowest, -limit), smaller(highest, limit)
-    right, left = smaller(larger(lift, low), high), smaller(larger(-lift, low), high)
+    low, high = maximum(lowest, -limit), minimum(highest, limit)
+    right, left = minimum(maximum(lift, low), high), minimum(maximum(-lift, low), high)
     e2_right, e2_left = height * right, height * left
-    reach_right = square_root(larger(log_ratio - e2_right * e2_right, spread(_ZERO)))
-    reach_left = square_root(larger(log_ratio - e2_left * e2_left, spread(_ZERO)))
+    reach_right = sqrt(maximum(log_ratio - e2_right * e2_right, broadcast(_ZERO)))
+    reach_left = sqrt(maximum(log_ratio - e2_left * e2_left, broadcast(_ZERO)))
     begin = records[i, 0] - _SLACK - width * (records[i, 3] * right + reach_right)
     end = records[i, 0] + _SLACK - width * (records[i, 3] * left - reach_left)
     return begin, end, touched
 
 
 @kernel
-def deal_pairs_part(
-    part, parts, order, records, bounds, tiles_x, first_rows, cursors, splat_starts, pairs, places
+def emit_intersections_part(
+    part, parts, order, records, bounds, tiles_x, first_rows, cursors, splat_offsets, pairs, places
 ):
     """Write one part's pairs into the tiles' lists, and their places with the splats."""
     n, flat, cursors = len(order), records.reshape(-1), cursors[part]
     for k in range(n * part // parts, n * (part + 1) // parts):
-        _fetch_ahead(flat, order, k)
+        _prefetch_record(flat, order, k)
         i = np.uint64(order[k])
         x0, x1, y0, y1 = _tile_span(bounds, i)
-        own = splat_starts[i]
+        own = splat_offsets[i]
         for row in range(y0, y1):
             begin, end, touched = _outline(records, i, np.float32(row * TILE), first_rows)
             for column in range(x0, x1):
@@ -154,7 +163,7 @@ def deal_pairs_part(
                 for block in range(COLUMNS):
                     first = left + np.float32(block * BLOCK_WIDTH)
                     meets = touched & (begin <= first + np.float32(BLOCK_WIDTH - 1)) & (end >= first)
-                    blocks |= (bits_of(meets) & _ALL_STRIPS) << np.uint32(block * STRIPS)
+                    blocks |= (movemask(meets) & _ALL_STRIPS) << np.uint32(block * STRIPS)
                 tile = np.uint64(row * tiles_x + column)
                 place = np.uint64(cursors[tile])
                 cursors[tile] += 1
@@ -164,14 +173,14 @@ def deal_pairs_part(
 
 
 @kernel
-def gather_sums_part(part, parts, splat_starts, places, pair_sums, sums):
+def reduce_sums_part(part, parts, splat_offsets, places, pair_sums, sums):
     """Add up the sums of each splat's pairs."""
-    n, flat = len(splat_starts) - 1, pair_sums.reshape(-1)
+    n, flat = len(splat_offsets) - 1, pair_sums.reshape(-1)
     for i in range(n * part // parts, n * (part + 1) // parts):
         for k in range(sums.shape[1]):
             sums[i, k] = _ZERO
-        for own in range(splat_starts[i], splat_starts[i + 1]):
-            if own + AHEAD < len(places):
-                prefetch(flat, np.uint64(places[own + AHEAD]) * np.uint64(sums.shape[1]))
+        for own in range(splat_offsets[i], splat_offsets[i + 1]):
+            if own + PREFETCH_DISTANCE < len(places):
+                prefetch(flat, np.uint64(places[own + PREFETCH_DISTANCE]) * np.uint64(sums.shape[1]))
             for k in range(sums.shape[1]):
                 sums[i, k] += pair_sums[places[own], k]

@@ -26,22 +26,22 @@ from dsar.raster.conventions import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from dsar.raster.jit import inlined, kernel
 from dsar.raster.simd import (
     LANES,
-    bits_of,
-    choose,
+    broadcast,
+    count_trailing_zeros,
+    exp2,
     load,
-    lowest_bit,
-    negated_size,
-    power_of_two,
+    minimum,
+    movemask,
+    negative_abs,
     prefetch,
-    smaller,
-    spread,
+    reduce_add,
+    select,
     store,
-    total,
 )
-from dsar.raster.tiles import AHEAD, BLOCK_HEIGHT, BLOCK_WIDTH, BLOCKS, RECORD_SIZE, STRIPS, TILE
+from dsar.raster.tiles import BLOCK_HEIGHT, BLOCK_WIDTH, BLOCKS, PREFETCH_DISTANCE, RECORD_SIZE, STRIPS, TILE
 
 # How many splats pass between two looks at which blocks are finished.
-_PATIENCE = 32
+_CHECK_INTERVAL = 32
 # Planes of a block. Both passes: transmittance, pixel centre x and y (from the tile's corner).
 _T, _X, _Y = (np.uint64(plane * LANES) for plane in (0, 1, 2))
 # Forward: what has been blended so far.
@@ -52,10 +52,12 @@ _V_RED, _V_GREEN, _V_BLUE, _V_DEPTH, _LEVEL, _REST = (
     np.uint64(plane * LANES) for plane in (3, 4, 5, 6, 7, 8)
 )
 _BACKWARD = np.uint64(9 * LANES)
-# Survey: depth at half transmittance, how many splats were blended, depth of the first, and the largest
-# weight with its splat (a number that is exact up to 16 million).
-_MEDIAN, _COUNT, _FRONT, _LARGEST, _HEAVIEST = (np.uint64(plane * LANES) for plane in (3, 4, 5, 6, 7))
-_SURVEY = np.uint64(8 * LANES)
+# Auxiliary pass: depth at half transmittance, how many splats were blended, depth of the first, and the
+# largest weight with its splat (a number that is exact up to 16 million).
+_MEDIAN, _COUNT, _FIRST_HIT, _LARGEST_WEIGHT, _LARGEST_ID = (
+    np.uint64(plane * LANES) for plane in (3, 4, 5, 6, 7)
+)
+_AUXILIARY = np.uint64(8 * LANES)
 
 _LOG_ALPHA_MIN, _LOG_ALPHA_MAX = np.float32(math.log2(ALPHA_MIN)), np.float32(math.log2(ALPHA_MAX))
 _ALPHA_MAX, _T_MIN = np.float32(ALPHA_MAX), np.float32(TRANSMITTANCE_MIN)
@@ -83,44 +85,44 @@ def _pixel(x, y, stride):
 
 
 @inlined
-def _open_tile(state, stride, width, height):
+def _init_tile(state, stride, width, height):
     """Start pixels inside the image, which ends at `width`, `height`, as transparent, others as finished."""
     width, height = np.float32(width), np.float32(height)
     for block in range(np.uint64(BLOCKS)):
         start = block * stride
         inside = (load(state, start + _X) < width) & (load(state, start + _Y) < height)
-        store(state, start, choose(inside, spread(_ONE), spread(-_ONE)))
+        store(state, start, select(inside, broadcast(_ONE), broadcast(-_ONE)))
 
 
 @inlined
-def _find_live(state, stride):
+def _find_active(state, stride):
     """Return the set of blocks with a pixel that is not finished."""
-    live = np.uint32(0)
+    active = np.uint32(0)
     for block in range(np.uint64(BLOCKS)):
-        if bits_of(load(state, block * stride) > _ZERO) != np.uint32(0):
-            live |= np.uint32(1) << np.uint32(block)
-    return live
+        if movemask(load(state, block * stride) > _ZERO) != np.uint32(0):
+            active |= np.uint32(1) << np.uint32(block)
+    return active
 
 
 @inlined
-def _fetch_ahead(records, pairs, place):
+def _prefetch_record(records, pairs, place):
     """Have the record of a splat that is due soon brought into the cache."""
-    due = place + np.uint64(AHEAD)
+    due = place + np.uint64(PREFETCH_DISTANCE)
     if due < np.uint64(len(pairs)):
         prefetch(records, np.uint64(pairs[due, 0]) * np.uint64(RECORD_SIZE))
 
 
 @inlined
-def _at_corner(records, i, left, top):
+def _splat_in_tile(records, i, left, top):
     """Return what `_blend` needs of a splat, with the tile's corner as origin."""
     x, y = records[i, 0] - np.float32(left), records[i, 1] - np.float32(top)
     return (
-        spread(records[i, 2] * x - records[i, 3] * y),
-        spread(records[i, 2]),
-        spread(records[i, 3]),
-        spread(records[i, 4] * y),
-        spread(records[i, 4]),
-        spread(records[i, 5]),
+        broadcast(records[i, 2] * x - records[i, 3] * y),
+        broadcast(records[i, 2]),
+        broadcast(records[i, 3]),
+        broadcast(records[i, 4] * y),
+        broadcast(records[i, 4]),
+        broadcast(records[i, 5]),
     )
 
 
@@ -130,13 +132,13 @@ def _blend(state, start, e1_origin, stretch, shear, e2_origin, height, log_opaci
     e1 = e1_origin - stretch * load(state, start + _X) + shear * load(state, start + _Y)
     e2 = e2_origin - height * load(state, start + _Y)
     log_alpha = log_opacity - e1 * e1 - e2 * e2
-    alpha = smaller(power_of_two(log_alpha), spread(_ALPHA_MAX))
+    alpha = minimum(exp2(log_alpha), broadcast(_ALPHA_MAX))
     before = load(state, start + _T)
-    weight = choose(log_alpha >= _LOG_ALPHA_MIN, alpha * before, spread(_ZERO))
+    weight = select(log_alpha >= _LOG_ALPHA_MIN, alpha * before, broadcast(_ZERO))
     after = before - weight
     running = after > _T_MIN
-    store(state, start + _T, choose(running, after, negated_size(before)))
-    return e1, e2, log_alpha, choose(running, weight, spread(_ZERO)), before
+    store(state, start + _T, select(running, after, negative_abs(before)))
+    return e1, e2, log_alpha, select(running, weight, broadcast(_ZERO)), before
 
 
 @inlined
@@ -145,7 +147,7 @@ def _add(state, place, values):
 
 
 @inlined
-def _fill_empty_tile(left, top, background, color, alpha, depth):
+def _write_empty_tile(left, top, background, color, alpha, depth):
     """Write a tile that no splat touches to the images."""
     height, width = alpha.shape
     for y in range(top, min(top + TILE, height)):
@@ -155,7 +157,7 @@ def _fill_empty_tile(left, top, background, color, alpha, depth):
 
 
 @inlined
-def _close_tile(state, left, top, background, color, alpha, depth):
+def _write_tile(state, left, top, background, color, alpha, depth):
     """Write a finished tile to the images."""
     height, width = alpha.shape
     for y in range(min(TILE, height - top)):
@@ -171,40 +173,40 @@ def _close_tile(state, left, top, background, color, alpha, depth):
 
 
 @kernel
-def composite_part(part, parts, records, tile_starts, pairs, tiles_x, background, color, alpha, depth):
+def composite_part(part, parts, records, tile_offsets, pairs, tiles_x, background, color, alpha, depth):
     """Blend the splats of every parts-th tile into the images."""
     height, width = alpha.shape
     state, flat = _new_state(_FORWARD), records.reshape(-1)
     # Neighbouring tiles cost about the same: dealing them out in turn keeps the parts even.
-    for tile in range(part, len(tile_starts) - 1, parts):
+    for tile in range(part, len(tile_offsets) - 1, parts):
         left, top = tile % tiles_x * TILE, tile // tiles_x * TILE
-        start, end = np.uint64(tile_starts[tile]), np.uint64(tile_starts[tile + 1])
+        start, end = np.uint64(tile_offsets[tile]), np.uint64(tile_offsets[tile + 1])
         if start == end:
-            _fill_empty_tile(left, top, background, color, alpha, depth)
+            _write_empty_tile(left, top, background, color, alpha, depth)
             continue
-        _open_tile(state, _FORWARD, width - left, height - top)
+        _init_tile(state, _FORWARD, width - left, height - top)
         for block in range(np.uint64(BLOCKS)):
             for plane in (_RED, _GREEN, _BLUE, _DEPTH):
-                store(state, block * _FORWARD + plane, spread(_ZERO))
-        live = _find_live(state, _FORWARD)
+                store(state, block * _FORWARD + plane, broadcast(_ZERO))
+        active = _find_active(state, _FORWARD)
         for place in range(start, end):
-            if (place - start) % np.uint64(_PATIENCE) == np.uint64(_PATIENCE - 1):
-                live = _find_live(state, _FORWARD)
-                if live == np.uint32(0):
+            if (place - start) % np.uint64(_CHECK_INTERVAL) == np.uint64(_CHECK_INTERVAL - 1):
+                active = _find_active(state, _FORWARD)
+                if active == np.uint32(0):
                     break
-            _fetch_ahead(flat, pairs, place)
-            blocks, i = np.uint32(pairs[place, 1]) & live, np.uint64(pairs[place, 0])
+            _prefetch_record(flat, pairs, place)
+            blocks, i = np.uint32(pairs[place, 1]) & active, np.uint64(pairs[place, 0])
             _blend_splat(state, blocks, records, i, left, top)
-        _close_tile(state, left, top, background, color, alpha, depth)
+        _write_tile(state, left, top, background, color, alpha, depth)
 
 
 @inlined
 def _blend_splat(state, blocks, records, i, left, top):
     """Blend one splat over a set of blocks."""
-    splat = _at_corner(records, i, left, top)
+    splat = _splat_in_tile(records, i, left, top)
     red, green, blue, z = records[i, 6], records[i, 7], records[i, 8], records[i, 9]
     while blocks != np.uint32(0):
-        start = lowest_bit(blocks) * _FORWARD
+        start = count_trailing_zeros(blocks) * _FORWARD
         blocks &= blocks - np.uint32(1)
         _, _, _, weight, _ = _blend(state, start, *splat)
         _add(state, start + _RED, weight * red)
@@ -216,13 +218,13 @@ def _blend_splat(state, blocks, records, i, left, top):
 @inlined
 def _blend_splat_backward(state, blocks, records, i, left, top, out):
     """Blend one splat again, and write its gradient sums over a set of blocks."""
-    splat = _at_corner(records, i, left, top)
+    splat = _splat_in_tile(records, i, left, top)
     red, green, blue, z = records[i, 6], records[i, 7], records[i, 8], records[i, 9]
-    zero = spread(_ZERO)
+    zero = broadcast(_ZERO)
     s, s1, s2, s11, s12, s22 = zero, zero, zero, zero, zero, zero
     v_red, v_green, v_blue, v_z = zero, zero, zero, zero
     while blocks != np.uint32(0):
-        start = lowest_bit(blocks) * _BACKWARD
+        start = count_trailing_zeros(blocks) * _BACKWARD
         blocks &= blocks - np.uint32(1)
         e1, e2, log_alpha, weight, before = _blend(state, start, *splat)
         q = red * load(state, start + _V_RED) + green * load(state, start + _V_GREEN)
@@ -235,7 +237,7 @@ def _blend_splat_backward(state, blocks, records, i, left, top, out):
         v_blue += weight * load(state, start + _V_BLUE)
         v_z += weight * load(state, start + _V_DEPTH)
         # v = -alpha dL/dalpha; where alpha is clamped it does not move with the splat's shape.
-        v = choose(log_alpha < _LOG_ALPHA_MAX, weight * (rest / (before - weight) - q), zero)
+        v = select(log_alpha < _LOG_ALPHA_MAX, weight * (rest / (before - weight) - q), zero)
         v1, v2 = v * e1, v * e2
         s += v
         s1 += v1
@@ -244,9 +246,14 @@ def _blend_splat_backward(state, blocks, records, i, left, top, out):
         s12 += v1 * e2
         s22 += v2 * e2
     out[0], out[1], out[2], out[3], out[4], out[5] = (
-        total(s), total(s1), total(s2), total(s11), total(s12), total(s22)
+        reduce_add(s), reduce_add(s1), reduce_add(s2), reduce_add(s11), reduce_add(s12), reduce_add(s22)
     )  # fmt: skip
-    out[6], out[7], out[8], out[9] = total(v_red), total(v_green), total(v_blue), total(v_z)
+    out[6], out[7], out[8], out[9] = (
+        reduce_add(v_red),
+        reduce_add(v_green),
+        reduce_add(v_blue),
+        reduce_add(v_z),
+    )
 
 
 @inlined
@@ -257,7 +264,7 @@ def _load_gradients(state, left, top, color, alpha, depth, v_color, v_alpha, v_d
         # Else pixels outside would keep the gradients of another tile.
         for block in range(np.uint64(BLOCKS)):
             for plane in (_V_RED, _V_GREEN, _V_BLUE, _V_DEPTH, _LEVEL, _REST):
-                store(state, block * _BACKWARD + plane, spread(_ZERO))
+                store(state, block * _BACKWARD + plane, broadcast(_ZERO))
     for y in range(top, min(top + TILE, height)):
         for x in range(left, min(left + TILE, width)):
             pixel = _pixel(x - left, y - top, _BACKWARD)
@@ -278,25 +285,25 @@ def _load_gradients(state, left, top, color, alpha, depth, v_color, v_alpha, v_d
 
 @kernel
 def composite_backward_part(
-    part, parts, records, tile_starts, pairs, tiles_x,
+    part, parts, records, tile_offsets, pairs, tiles_x,
     color, alpha, depth, v_color, v_alpha, v_depth, pair_sums,
 ):  # fmt: skip
     """Write the gradient sums of every pair in every parts-th tile. Empty v_* mean zero."""
     height, width = alpha.shape
     state, flat = _new_state(_BACKWARD), records.reshape(-1)
-    for tile in range(part, len(tile_starts) - 1, parts):
+    for tile in range(part, len(tile_offsets) - 1, parts):
         left, top = tile % tiles_x * TILE, tile // tiles_x * TILE
-        start, end = np.uint64(tile_starts[tile]), np.uint64(tile_starts[tile + 1])
+        start, end = np.uint64(tile_offsets[tile]), np.uint64(tile_offsets[tile + 1])
         if start == end:
             continue
-        _open_tile(state, _BACKWARD, width - left, height - top)
+        _init_tile(state, _BACKWARD, width - left, height - top)
         _load_gradients(state, left, top, color, alpha, depth, v_color, v_alpha, v_depth)
-        live = _find_live(state, _BACKWARD)
+        active = _find_active(state, _BACKWARD)
         for place in range(start, end):
-            if (place - start) % np.uint64(_PATIENCE) == np.uint64(_PATIENCE - 1):
-                live = _find_live(state, _BACKWARD)
-            _fetch_ahead(flat, pairs, place)
-            blocks, i = np.uint32(pairs[place, 1]) & live, np.uint64(pairs[place, 0])
+            if (place - start) % np.uint64(_CHECK_INTERVAL) == np.uint64(_CHECK_INTERVAL - 1):
+                active = _find_active(state, _BACKWARD)
+            _prefetch_record(flat, pairs, place)
+            blocks, i = np.uint32(pairs[place, 1]) & active, np.uint64(pairs[place, 0])
             if blocks == np.uint32(0):
                 pair_sums[place] = _ZERO
             else:
@@ -304,75 +311,75 @@ def composite_backward_part(
 
 
 @inlined
-def _note(state, start, i, z, weight, before):
+def _accumulate_auxiliary(state, start, i, z, weight, before):
     """Remember of a splat what is asked about a block's pixels."""
     blended = weight > _ZERO
-    z = spread(z)
-    median, front = load(state, start + _MEDIAN), load(state, start + _FRONT)
+    z = broadcast(z)
+    median, first_hit = load(state, start + _MEDIAN), load(state, start + _FIRST_HIT)
     count = load(state, start + _COUNT)
-    store(state, start + _MEDIAN, choose(blended & (before > _HALF), z, median))
-    store(state, start + _FRONT, choose(blended & (count < _HALF), z, front))
-    store(state, start + _COUNT, count + choose(blended, spread(_ONE), spread(_ZERO)))
-    largest, heaviest = load(state, start + _LARGEST), load(state, start + _HEAVIEST)
+    store(state, start + _MEDIAN, select(blended & (before > _HALF), z, median))
+    store(state, start + _FIRST_HIT, select(blended & (count < _HALF), z, first_hit))
+    store(state, start + _COUNT, count + select(blended, broadcast(_ONE), broadcast(_ZERO)))
+    largest, largest_id = load(state, start + _LARGEST_WEIGHT), load(state, start + _LARGEST_ID)
     heavier = weight > largest
-    store(state, start + _LARGEST, choose(heavier, weight, largest))
-    store(state, start + _HEAVIEST, choose(heavier, spread(np.float32(i)), heaviest))
+    store(state, start + _LARGEST_WEIGHT, select(heavier, weight, largest))
+    store(state, start + _LARGEST_ID, select(heavier, broadcast(np.float32(i)), largest_id))
 
 
 @kernel
-def survey_part(
-    part, parts, records, tile_starts, pairs, tiles_x, starts,
-    medians, fronts, heaviest, counts, ids, weights,
+def composite_auxiliary_part(
+    part, parts, records, tile_offsets, pairs, tiles_x, starts,
+    medians, first_hits, largest_id, counts, ids, weights,
 ):  # fmt: skip
-    """Blend every parts-th tile once more, for depths, the heaviest splat and how many each pixel has.
+    """Blend every parts-th tile once more, for depths, the largest weight and how many each pixel has.
 
     If `ids` is not empty, write each pixel's splats and weights from its start on. One kernel does both,
     because another might round otherwise, and find another number of splats.
     """
     height, width = medians.shape
-    state, flat = _new_state(_SURVEY), records.reshape(-1)
+    state, flat = _new_state(_AUXILIARY), records.reshape(-1)
     lanes, cursors = np.empty(LANES, np.float32), np.zeros(BLOCKS * LANES, np.int64)
     collecting = len(ids) > 0
-    for tile in range(part, len(tile_starts) - 1, parts):
+    for tile in range(part, len(tile_offsets) - 1, parts):
         left, top = tile % tiles_x * TILE, tile // tiles_x * TILE
-        _open_tile(state, _SURVEY, width - left, height - top)
+        _init_tile(state, _AUXILIARY, width - left, height - top)
         for block in range(np.uint64(BLOCKS)):
-            for plane in (_MEDIAN, _COUNT, _FRONT, _LARGEST):
-                store(state, block * _SURVEY + plane, spread(_ZERO))
-            store(state, block * _SURVEY + _HEAVIEST, spread(-_ONE))
+            for plane in (_MEDIAN, _COUNT, _FIRST_HIT, _LARGEST_WEIGHT):
+                store(state, block * _AUXILIARY + plane, broadcast(_ZERO))
+            store(state, block * _AUXILIARY + _LARGEST_ID, broadcast(-_ONE))
         if collecting:
             for y in range(min(TILE, height - top)):
                 for x in range(min(TILE, width - left)):
                     cursors[_pixel(x, y, np.uint64(LANES))] = starts[(top + y) * width + left + x]
-        live = _find_live(state, _SURVEY)
-        first, end = np.uint64(tile_starts[tile]), np.uint64(tile_starts[tile + 1])
+        active = _find_active(state, _AUXILIARY)
+        first, end = np.uint64(tile_offsets[tile]), np.uint64(tile_offsets[tile + 1])
         for place in range(first, end):
-            if (place - first) % np.uint64(_PATIENCE) == np.uint64(_PATIENCE - 1):
-                live = _find_live(state, _SURVEY)
-                if live == np.uint32(0):
+            if (place - first) % np.uint64(_CHECK_INTERVAL) == np.uint64(_CHECK_INTERVAL - 1):
+                active = _find_active(state, _AUXILIARY)
+                if active == np.uint32(0):
                     break
-            _fetch_ahead(flat, pairs, place)
-            blocks, i = np.uint32(pairs[place, 1]) & live, np.uint64(pairs[place, 0])
-            splat = _at_corner(records, i, left, top)
+            _prefetch_record(flat, pairs, place)
+            blocks, i = np.uint32(pairs[place, 1]) & active, np.uint64(pairs[place, 0])
+            splat = _splat_in_tile(records, i, left, top)
             while blocks != np.uint32(0):
-                block = lowest_bit(blocks)
-                start = block * _SURVEY
+                block = count_trailing_zeros(blocks)
+                start = block * _AUXILIARY
                 blocks &= blocks - np.uint32(1)
                 _, _, _, weight, before = _blend(state, start, *splat)
                 blended = weight > _ZERO
-                _note(state, start, i, records[i, 9], weight, before)
+                _accumulate_auxiliary(state, start, i, records[i, 9], weight, before)
                 store(lanes, np.uint64(0), weight)
-                hits = bits_of(blended) if collecting else np.uint32(0)
+                hits = movemask(blended) if collecting else np.uint32(0)
                 while hits != np.uint32(0):
-                    lane = lowest_bit(hits)
+                    lane = count_trailing_zeros(hits)
                     hits &= hits - np.uint32(1)
                     pixel = block * np.uint64(LANES) + lane
                     ids[cursors[pixel]], weights[cursors[pixel]] = i, lanes[lane]
                     cursors[pixel] += 1
         for y in range(min(TILE, height - top)):
             for x in range(min(TILE, width - left)):
-                pixel = _pixel(x, y, _SURVEY)
+                pixel = _pixel(x, y, _AUXILIARY)
                 medians[top + y, left + x] = state[pixel + _MEDIAN]
-                fronts[top + y, left + x] = state[pixel + _FRONT]
-                heaviest[top + y, left + x] = np.int64(state[pixel + _HEAVIEST])
+                first_hits[top + y, left + x] = state[pixel + _FIRST_HIT]
+                largest_id[top + y, left + x] = np.int64(state[pixel + _LARGEST_ID])
                 counts[top + y, left + x] = np.int64(state[pixel + _COUNT])

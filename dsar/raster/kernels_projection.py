@@ -24,15 +24,15 @@ from dsar.raster.conventions import ALPHA_MIN, FRUSTUM_MARGIN, NEAR
 from dsar.raster.jit import inlined, kernel
 from dsar.raster.simd import (
     LANES,
-    choose,
-    larger,
-    log_two,
+    broadcast,
+    floor,
+    log2,
+    maximum,
+    minimum,
     plane,
     planes,
-    round_down,
-    smaller,
-    spread,
-    square_root,
+    select,
+    sqrt,
     write_plane,
 )
 from dsar.raster.tiles import SUMS_SIZE
@@ -42,7 +42,7 @@ _MARGIN = np.float32(0.5 * FRUSTUM_MARGIN)
 _ALPHA_MIN = np.float32(ALPHA_MIN)
 _LOG_ALPHA_MIN = np.float32(math.log2(ALPHA_MIN))
 _LOG2_E, _LN_2 = np.float32(math.log2(math.e)), np.float32(math.log(2))
-_LARGEST = np.finfo(np.float32).max
+_FLOAT_MAX = np.finfo(np.float32).max
 _ZERO, _HALF, _ONE, _TWO = (np.float32(value) for value in (0.0, 0.5, 1.0, 2.0))
 # Scratch planes: what comes in (mean, rotation, scales, opacity, then the sums of the backward pass) ...
 _MEAN, _ROTATION, _SCALES, _OPACITY, _SUMS = 0, 3, 7, 10, 11
@@ -72,7 +72,7 @@ def _row(matrix, start):
 
 
 @inlined
-def _lay_out(scratch, start, end, means, rotations, scales, opacities):
+def _load_planes(scratch, start, end, means, rotations, scales, opacities):
     """Copy LANES rows into the scratch planes; the last row stands in for those beyond the end."""
     for lane in range(LANES):
         i = min(start + lane, end - 1)
@@ -88,7 +88,7 @@ def _lay_out(scratch, start, end, means, rotations, scales, opacities):
 def _unit_quaternion(scratch):
     """Return quaternions normalised, and the inverses of their norms (infinite for a zero quaternion)."""
     w, (x, y, z) = plane(scratch, _ROTATION), planes(scratch, _ROTATION + 1)
-    inverse = _ONE / square_root(w * w + x * x + y * y + z * z)
+    inverse = _ONE / sqrt(w * w + x * x + y * y + z * z)
     return w * inverse, x * inverse, y * inverse, z * inverse, inverse
 
 
@@ -117,15 +117,15 @@ def _clamped_tangent(tangent, focal, center, size):
     """Return x/z limited to the widened image (beyond, linearising explodes), and where it was inside."""
     margin = _MARGIN * size / focal
     low, high = -center / focal - margin, (size - center) / focal + margin
-    return smaller(larger(tangent, spread(low)), spread(high)), (tangent >= low) & (tangent <= high)
+    return minimum(maximum(tangent, broadcast(low)), broadcast(high)), (tangent >= low) & (tangent <= high)
 
 
 @inlined
 def _image_axes(point, camera, width, height):
     """Return d(pixel x)/d(world), d(pixel y)/d(world), and whether each was linearised at the mean itself."""
     inverse_z = _ONE / point[2]
-    tx, free_x = _clamped_tangent(point[0] * inverse_z, camera[12], camera[14], width)
-    ty, free_y = _clamped_tangent(point[1] * inverse_z, camera[13], camera[15], height)
+    tx, unclamped_x = _clamped_tangent(point[0] * inverse_z, camera[12], camera[14], width)
+    ty, unclamped_y = _clamped_tangent(point[1] * inverse_z, camera[13], camera[15], height)
     fx, fy = camera[12] * inverse_z, camera[13] * inverse_z
     right, down, forward = _row(camera, 0), _row(camera, 3), _row(camera, 6)
     u1 = (
@@ -138,7 +138,7 @@ def _image_axes(point, camera, width, height):
         fy * (down[1] - ty * forward[1]),
         fy * (down[2] - ty * forward[2]),
     )
-    return u1, u2, free_x, free_y
+    return u1, u2, unclamped_x, unclamped_y
 
 
 @inlined
@@ -178,9 +178,9 @@ def _covariance(m1, m2, normal, dilation):
 @inlined
 def _pixel_range(center, radius, size):
     """Return the first and end index of the pixels whose centres lie within a radius, inside the image."""
-    first, end = -round_down(radius + _HALF - center), round_down(center + radius + _HALF)
-    low, high = spread(_ZERO), spread(size)
-    return smaller(larger(first, low), high), smaller(larger(end, low), high)
+    first, end = -floor(radius + _HALF - center), floor(center + radius + _HALF)
+    low, high = broadcast(_ZERO), broadcast(size)
+    return minimum(maximum(first, low), high), minimum(maximum(end, low), high)
 
 
 @inlined
@@ -193,37 +193,37 @@ def _project(scratch, camera, width, height):
     u1, u2, _, _ = _image_axes(point, camera, width, height)
     g1, g2 = _times_matrix(u1, rows), _times_matrix(u2, rows)
     normal = _normal(g1, g2, scales)
-    a, b, c, slim = _covariance(_scaled(g1, scales), _scaled(g2, scales), normal, camera[16])
+    a, b, c, schur = _covariance(_scaled(g1, scales), _scaled(g2, scales), normal, camera[16])
     if camera[17] > _ZERO:
-        opacity = opacity * square_root(_dot(normal, normal) / (slim * c))
+        opacity = opacity * sqrt(_dot(normal, normal) / (schur * c))
     mean_x = camera[12] * point[0] / point[2] + camera[14]
     mean_y = camera[13] * point[1] / point[2] + camera[15]
-    log_opacity = log_two(opacity)
+    log_opacity = log2(opacity)
     # Alpha is at least ALPHA_MIN within this many variances, squared, of the mean.
     reach = (_TWO * _LN_2) * (log_opacity - _LOG_ALPHA_MIN) + np.float32(1e-4)
-    x0, x1 = _pixel_range(mean_x, square_root(reach * a), width)
-    y0, y1 = _pixel_range(mean_y, square_root(reach * c), height)
+    x0, x1 = _pixel_range(mean_x, sqrt(reach * a), width)
+    y0, y1 = _pixel_range(mean_y, sqrt(reach * c), height)
     # Comparisons with NaN fail, and so does one with an infinite or NaN sum.
-    finite = mean_x + mean_y + point[2] + a + c + slim + opacity
-    sound = (finite <= _LARGEST) & (finite >= -_LARGEST)
+    finite = mean_x + mean_y + point[2] + a + c + schur + opacity
+    sound = (finite <= _FLOAT_MAX) & (finite >= -_FLOAT_MAX)
     # A quaternion whose square overflows has no inverse norm.
-    sound = sound & (inverse > _ZERO) & (smaller(smaller(scales[0], scales[1]), scales[2]) > _ZERO)
+    sound = sound & (inverse > _ZERO) & (minimum(minimum(scales[0], scales[1]), scales[2]) > _ZERO)
     drawn = sound & (point[2] > _NEAR) & (opacity >= _ALPHA_MIN) & (x0 < x1) & (y0 < y1)
-    stretch = square_root(_HALF * _LOG2_E / slim)
+    stretch = sqrt(_HALF * _LOG2_E / schur)
     write_plane(scratch, 0, mean_x)
     write_plane(scratch, 1, mean_y)
     write_plane(scratch, 2, stretch)
     write_plane(scratch, 3, stretch * b / c)
-    write_plane(scratch, 4, square_root(_HALF * _LOG2_E / c))
+    write_plane(scratch, 4, sqrt(_HALF * _LOG2_E / c))
     write_plane(scratch, 5, log_opacity)
     write_plane(scratch, 9, point[2])
-    write_plane(scratch, 10, square_root(reach * c))
-    write_plane(scratch, 11, b * square_root(reach / a))
-    nothing = spread(_ZERO)
-    write_plane(scratch, _BOUNDS, choose(drawn, x0, nothing))
-    write_plane(scratch, _BOUNDS + 1, choose(drawn, x1, nothing))
-    write_plane(scratch, _BOUNDS + 2, choose(drawn, y0, nothing))
-    write_plane(scratch, _BOUNDS + 3, choose(drawn, y1, nothing))
+    write_plane(scratch, 10, sqrt(reach * c))
+    write_plane(scratch, 11, b * sqrt(reach / a))
+    nothing = broadcast(_ZERO)
+    write_plane(scratch, _BOUNDS, select(drawn, x0, nothing))
+    write_plane(scratch, _BOUNDS + 1, select(drawn, x1, nothing))
+    write_plane(scratch, _BOUNDS + 2, select(drawn, y0, nothing))
+    write_plane(scratch, _BOUNDS + 3, select(drawn, y1, nothing))
 
 
 @kernel
@@ -234,7 +234,7 @@ def project_part(part, parts, means, rotations, scales, opacities, camera, width
     scratch = np.empty(_PLANES * LANES, np.float32)
     end = n * (part + 1) // parts
     for start in range(n * part // parts, end, LANES):
-        _lay_out(scratch, start, end, means, rotations, scales, opacities)
+        _load_planes(scratch, start, end, means, rotations, scales, opacities)
         _project(scratch, camera, width, height)
         for lane in range(min(LANES, end - start)):
             for k in range(_BOUNDS):
@@ -244,19 +244,19 @@ def project_part(part, parts, means, rotations, scales, opacities, camera, width
 
 
 @inlined
-def _splat_gradient(scratch, a, b, c, slim):
+def _splat_gradient(scratch, a, b, c, schur):
     """Return dL/d(mean x, mean y, A, B, C) from a splat's sums over its pixels (see kernels_compositing)."""
-    stretch, height, ratio = square_root(_HALF * _LOG2_E / slim), square_root(_HALF * _LOG2_E / c), b / c
+    stretch, height, ratio = sqrt(_HALF * _LOG2_E / schur), sqrt(_HALF * _LOG2_E / c), b / c
     # The sums are of powers of e, the factors in powers of two.
     v_e1, v_e2 = (_TWO * _LN_2) * plane(scratch, _SUMS + 1), (_TWO * _LN_2) * plane(scratch, _SUMS + 2)
     v_e11, v_e12, v_e22 = planes(scratch, _SUMS + 3)
     v_x = stretch * v_e1
     v_y = height * v_e2 - ratio * stretch * v_e1
-    v_slim = -(_LN_2 * v_e11 / slim)
+    v_schur = -(_LN_2 * v_e11 / schur)
     v_ratio = -((_TWO * _LN_2) * stretch / height * v_e12)
-    v_b = v_ratio / c - _TWO * v_slim * ratio
-    v_c = v_slim * ratio * ratio - (v_ratio * ratio + _LN_2 * v_e22) / c
-    return v_x, v_y, v_slim, v_b, v_c
+    v_b = v_ratio / c - _TWO * v_schur * ratio
+    v_c = v_schur * ratio * ratio - (v_ratio * ratio + _LN_2 * v_e22) / c
+    return v_x, v_y, v_schur, v_b, v_c
 
 
 @inlined
@@ -284,13 +284,13 @@ def _write_rotation_gradient(scratch, u1, u2, v_g1, v_g2, quaternion):
 
 
 @inlined
-def _write_mean_gradient(scratch, point, camera, u1, u2, free_x, free_y, v_u1, v_u2, v_x, v_y):
+def _write_mean_gradient(scratch, point, camera, u1, u2, unclamped_x, unclamped_y, v_u1, v_u2, v_x, v_y):
     """Chain dL/d(image axes, mean on the image, depth) to the mean in the world."""
     inverse_z = _ONE / point[2]
     fx, fy, forward = camera[12] * inverse_z, camera[13] * inverse_z, _row(camera, 6)
     # A clamped tangent is a constant of the linearisation.
-    v_tx = choose(free_x, -(fx * _dot(v_u1, forward)), spread(_ZERO))
-    v_ty = choose(free_y, -(fy * _dot(v_u2, forward)), spread(_ZERO))
+    v_tx = select(unclamped_x, -(fx * _dot(v_u1, forward)), broadcast(_ZERO))
+    v_ty = select(unclamped_y, -(fy * _dot(v_u2, forward)), broadcast(_ZERO))
     v_right = (camera[12] * v_x + v_tx) * inverse_z
     v_down = (camera[13] * v_y + v_ty) * inverse_z
     # u1 and u2 are proportional to 1/z, and so are the tangents.
@@ -323,17 +323,17 @@ def _project_backward(scratch, camera, width, height):
     point = _camera_point(mean, camera)
     quaternion = _unit_quaternion(scratch)
     rows = _rotation_rows(quaternion[0], quaternion[1], quaternion[2], quaternion[3])
-    u1, u2, free_x, free_y = _image_axes(point, camera, width, height)
+    u1, u2, unclamped_x, unclamped_y = _image_axes(point, camera, width, height)
     g1, g2 = _times_matrix(u1, rows), _times_matrix(u2, rows)
     m1, m2 = _scaled(g1, scales), _scaled(g2, scales)
     normal = _normal(g1, g2, scales)
-    a, b, c, slim = _covariance(m1, m2, normal, camera[16])
-    v_x, v_y, v_a, v_b, v_c = _splat_gradient(scratch, a, b, c, slim)
-    # Antialiased, opacity is proportional to |normal| / sqrt(slim c).
-    v_log = -plane(scratch, _SUMS) if camera[17] > _ZERO else spread(_ZERO)
-    v_a += -(_HALF * v_log / slim)
-    v_b += v_log * b / (slim * c)
-    v_c += -(_HALF * v_log * a / (slim * c))
+    a, b, c, schur = _covariance(m1, m2, normal, camera[16])
+    v_x, v_y, v_a, v_b, v_c = _splat_gradient(scratch, a, b, c, schur)
+    # Antialiased, opacity is proportional to |normal| / sqrt(schur c).
+    v_log = -plane(scratch, _SUMS) if camera[17] > _ZERO else broadcast(_ZERO)
+    v_a += -(_HALF * v_log / schur)
+    v_b += v_log * b / (schur * c)
+    v_c += -(_HALF * v_log * a / (schur * c))
     twice_a, twice_c = _TWO * v_a, _TWO * v_c
     v_m1 = (
         twice_a * m1[0] + v_b * m2[0],
@@ -360,7 +360,7 @@ def _project_backward(scratch, camera, width, height):
     _write_rotation_gradient(scratch, u1, u2, v_g1, v_g2, quaternion)
     v_u1 = (_dot(rows[0], v_g1), _dot(rows[1], v_g1), _dot(rows[2], v_g1))
     v_u2 = (_dot(rows[0], v_g2), _dot(rows[1], v_g2), _dot(rows[2], v_g2))
-    _write_mean_gradient(scratch, point, camera, u1, u2, free_x, free_y, v_u1, v_u2, v_x, v_y)
+    _write_mean_gradient(scratch, point, camera, u1, u2, unclamped_x, unclamped_y, v_u1, v_u2, v_x, v_y)
     write_plane(scratch, _OPACITY, -(plane(scratch, _SUMS) / opacity))
 
 
@@ -375,7 +375,7 @@ def project_backward_part(
     scratch = np.empty(_PLANES * LANES, np.float32)
     end = n * (part + 1) // parts
     for start in range(n * part // parts, end, LANES):
-        _lay_out(scratch, start, end, means, rotations, scales, opacities)
+        _load_planes(scratch, start, end, means, rotations, scales, opacities)
         for lane in range(LANES):
             for k in range(SUMS_SIZE):
                 scratch[(_SUMS + k) * LANES + lane] = sums[min(start + lane, end - 1), k]

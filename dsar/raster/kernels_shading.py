@@ -18,7 +18,7 @@ _C3A, _C3B, _C3C = (
     np.float32(value) for value in (0.5900435899266435, 2.890611442640554, 0.4570457994644658)
 )
 _C3D, _C3E = np.float32(0.3731763325901154), np.float32(1.445305721320277)
-_LARGEST = np.finfo(np.float32).max
+_FLOAT_MAX = np.finfo(np.float32).max
 _ZERO, _HALF, _ONE, _TWO, _THREE, _FOUR, _FIVE, _SIX, _TEN, _FIFTEEN = (
     np.float32(value) for value in (0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 10.0, 15.0)
 )
@@ -89,7 +89,7 @@ def shade_part(part, parts, means, harmonics, center, records, bounds):
             green += basis[k] * harmonics[i, k, 1]
             blue += basis[k] * harmonics[i, k, 2]
         # Not math.isfinite: it subtracts the value from itself, which the compiler may fold to zero.
-        if not abs(red + green + blue) <= _LARGEST:
+        if not abs(red + green + blue) <= _FLOAT_MAX:
             bounds[i, 0] = bounds[i, 1] = bounds[i, 2] = bounds[i, 3] = 0
             continue
         records[i, 6], records[i, 7], records[i, 8] = max(red, _ZERO), max(green, _ZERO), max(blue, _ZERO)

@@ -30,18 +30,18 @@ class MeshView:
 def rasterize_mesh(vertices: Float[Tensor, "v 3"], faces: Int64[Tensor, "f 3"], camera: Camera) -> MeshView:
     """Return what a camera sees of a mesh in world metres."""
     pixels, depth = project(camera, vertices.double())
-    found, weights, nearest = _fill(
+    face_ids, weights, z_buffer = _fill_triangles(
         pixels.numpy(), depth.numpy(), faces.numpy(), camera.width, camera.height, NEAR
     )
-    return MeshView(torch.from_numpy(found), torch.from_numpy(weights), torch.from_numpy(nearest))
+    return MeshView(torch.from_numpy(face_ids), torch.from_numpy(weights), torch.from_numpy(z_buffer))
 
 
 @kernel
-def _fill(pixels, depth, faces, width, height, near):
+def _fill_triangles(pixels, depth, faces, width, height, near):
     """Return triangle, weights and depth of every pixel (`pixels` are corners' places in the image)."""
-    found = np.full((height, width), -1, np.int64)
+    face_ids = np.full((height, width), -1, np.int64)
     weights = np.zeros((height, width, 3), np.float32)
-    nearest = np.full((height, width), np.inf, np.float32)
+    z_buffer = np.full((height, width), np.inf, np.float32)
     for face in range(len(faces)):
         a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
         za, zb, zc = depth[a], depth[b], depth[c]
@@ -64,9 +64,9 @@ def _fill(pixels, depth, faces, width, height, near):
                 if u < 0 or v < 0 or w < 0:
                     continue
                 z = 1 / (u / za + v / zb + w / zc)
-                if z < nearest[row, column]:
-                    nearest[row, column], found[row, column] = z, face
+                if z < z_buffer[row, column]:
+                    z_buffer[row, column], face_ids[row, column] = z, face
                     weights[row, column, 0] = u / za * z
                     weights[row, column, 1] = v / zb * z
                     weights[row, column, 2] = w / zc * z
-    return found, weights, nearest
+    return face_ids, weights, z_buffer

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from dsar.geometry.harmonics import color_from_harmonics
 from dsar.geometry.rotations import matrix_from_quaternion
-from dsar.raster.contributors import find_front_depth, find_heaviest
+from dsar.raster.contributors import find_first_hit_depth, find_largest_weight_id
 from dsar.raster.conventions import (
     ALPHA_MAX,
     ALPHA_MIN,
@@ -79,12 +79,12 @@ def rasterize_reference(
     extras: dict[str, Any] = {}
     if "median_depth" in outputs:
         extras["median_depth"] = torch.cat([torch.cat([t.median_depth for t in row], 1) for row in rows], 0)
-    if {"front_depth", "heaviest", "contributors"} & set(outputs):
+    if {"first_hit_depth", "largest_weight_id", "contributors"} & set(outputs):
         contributors = _join([tile for row in rows for tile in row], camera)
         depths = splats.features.new_zeros(len(gaussians)).index_copy(0, splats.ids, splats.features[:, 3])
         found = {
-            "front_depth": lambda: find_front_depth(contributors, depths.detach()),
-            "heaviest": lambda: find_heaviest(contributors),
+            "first_hit_depth": lambda: find_first_hit_depth(contributors, depths.detach()),
+            "largest_weight_id": lambda: find_largest_weight_id(contributors),
             "contributors": lambda: contributors,
         }
         extras |= {name: found[name]() for name in outputs if name in found}
@@ -156,13 +156,13 @@ def _project(
     limited = tangents.maximum(-center / focal - margin).minimum((size - center) / focal + margin)
     jacobian = torch.cat([torch.diag_embed(focal / z), -(focal * limited / z)[..., None]], -1)
     axes = matrix_from_quaternion(gaussians.rotations) * gaussians.scales[:, None, :]
-    spread = jacobian @ transform[:3, :3] @ axes
-    covariances = spread @ spread.mT
-    dilated = covariances + dilation * torch.eye(2).to(spread)
+    projected_axes = jacobian @ transform[:3, :3] @ axes
+    covariances = projected_axes @ projected_axes.mT
+    dilated = covariances + dilation * torch.eye(2).to(projected_axes)
     opacities = gaussians.opacities
     if antialiased:
         # The cross product keeps the digits of a thin splat's determinant.
-        determinants = torch.linalg.cross(spread[:, 0], spread[:, 1]).square().sum(-1)
+        determinants = torch.linalg.cross(projected_axes[:, 0], projected_axes[:, 1]).square().sum(-1)
         opacities = opacities * (determinants / torch.linalg.det(dilated)).sqrt()
     return focal * tangents + center, dilated, z[:, 0], opacities
 

@@ -56,7 +56,7 @@ def _constant(value: float) -> ir.Constant:
     return ir.Constant(_FLOATS, [float(np.float32(value))] * LANES)
 
 
-def _spread(builder: ir.IRBuilder, value: Any) -> Any:
+def _broadcast(builder: ir.IRBuilder, value: Any) -> Any:
     """Return a scalar in every lane, a vector as it is."""
     if isinstance(value.type, ir.VectorType):
         return value
@@ -81,7 +81,7 @@ def _define(
 
         @lower_builtin(function, *one)
         def lower(context, builder, signature, arguments):
-            return emit(builder, *(_spread(builder, argument) for argument in arguments))
+            return emit(builder, *(_broadcast(builder, argument) for argument in arguments))
 
 
 _define(operator.add, floats, _PAIRS, lambda builder, x, y: builder.fadd(x, y))
@@ -180,17 +180,17 @@ def prefetch(typing, array, index):
 
 
 @_operation
-def spread(typing, value):
+def broadcast(typing, value):
     """Return one float32 in every lane."""
 
     def emit(context, builder, signature, arguments):
-        return _spread(builder, arguments[0])
+        return _broadcast(builder, arguments[0])
 
     return floats(types.float32), emit
 
 
 @_operation
-def choose(typing, condition, one, other):
+def select(typing, condition, one, other):
     """Return, lane by lane, `one` where the condition holds, else `other`."""
 
     def emit(context, builder, signature, arguments):
@@ -200,7 +200,7 @@ def choose(typing, condition, one, other):
 
 
 @_operation
-def smaller(typing, one, other):
+def minimum(typing, one, other):
     """Return, lane by lane, the smaller of two; the second where either is NaN."""
 
     def emit(context, builder, signature, arguments):
@@ -210,7 +210,7 @@ def smaller(typing, one, other):
 
 
 @_operation
-def larger(typing, one, other):
+def maximum(typing, one, other):
     """Return, lane by lane, the larger of two; the second where either is NaN."""
 
     def emit(context, builder, signature, arguments):
@@ -220,7 +220,7 @@ def larger(typing, one, other):
 
 
 @_operation
-def negated_size(typing, values):
+def negative_abs(typing, values):
     """Return -abs(values)."""
 
     def emit(context, builder, signature, arguments):
@@ -230,7 +230,7 @@ def negated_size(typing, values):
 
 
 @_operation
-def square_root(typing, values):
+def sqrt(typing, values):
     """Return the square root of every lane."""
 
     def emit(context, builder, signature, arguments):
@@ -240,7 +240,7 @@ def square_root(typing, values):
 
 
 @_operation
-def round_down(typing, values):
+def floor(typing, values):
     """Return the largest whole number that is not larger, in every lane."""
 
     def emit(context, builder, signature, arguments):
@@ -250,7 +250,7 @@ def round_down(typing, values):
 
 
 @_operation
-def total(typing, values):
+def reduce_add(typing, values):
     """Return the sum of all lanes."""
 
     def emit(context, builder, signature, arguments):
@@ -261,7 +261,7 @@ def total(typing, values):
 
 
 @_operation
-def bits_of(typing, condition):
+def movemask(typing, condition):
     """Return a condition as an integer: bit k is lane k."""
 
     def emit(context, builder, signature, arguments):
@@ -271,7 +271,7 @@ def bits_of(typing, condition):
 
 
 @_operation
-def lowest_bit(typing, bits):
+def count_trailing_zeros(typing, bits):
     """Return the position of the lowest bit that is set in a uint32 other than 0."""
 
     def emit(context, builder, signature, arguments):
@@ -287,7 +287,7 @@ _P0, _P1, _P2, _P3, _P4, _P5 = _POWER.convert(kind=np.polynomial.Polynomial).coe
 
 
 @_operation
-def power_of_two(typing, values):
+def exp2(typing, values):
     """Return 2**values to 2e-7 relative for values in [-126, 127]; anything beyond."""
 
     def emit(context, builder, signature, arguments):
@@ -314,7 +314,7 @@ _LOGARITHM_TERMS = _LOGARITHM.convert(kind=np.polynomial.Polynomial).coef
 
 
 @_operation
-def log_two(typing, values):
+def log2(typing, values):
     """Return the logarithm to base 2 of positive, normal values; anything for others."""
 
     def emit(context, builder, signature, arguments):

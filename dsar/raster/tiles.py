@@ -11,7 +11,7 @@ RECORD_SIZE = 16
 """Numbers in a splat's record (see kernels_projection): a cache line."""
 SUMS_SIZE = 10
 """Numbers in the gradient sums of a splat, or of its pair with a tile (see kernels_compositing)."""
-AHEAD = 8
+PREFETCH_DISTANCE = 8
 """How many splats before its turn a record is fetched (in order of depth they lie all over the memory): as
 long as a trip to the third cache takes."""
 TILE_BITS = 4

@@ -52,11 +52,11 @@ def estimate(config: TrainConfig) -> Budget:
     size, schedule = map_size(config), config.schedule
     with torch.device("meta"):
         network = DualStreamNetwork(config.model, torch.ones(size, dtype=torch.bool))
-        state = network.start(schedule.streams)
-        maps = torch.empty(schedule.streams, config.model.map_channels, *size)
-        magnitude = torch.empty(schedule.streams, 1, *size)
+        state = network.initial_state(schedule.rollouts_per_worker)
+        maps = torch.empty(schedule.rollouts_per_worker, config.model.map_channels, *size)
+        magnitude = torch.empty(schedule.rollouts_per_worker, 1, *size)
     # The network looks at it, so it needs values.
-    state = dataclasses.replace(state, fresh=torch.zeros(schedule.streams, dtype=torch.bool))
+    state = dataclasses.replace(state, fresh=torch.zeros(schedule.rollouts_per_worker, dtype=torch.bool))
     kept: list[Tensor] = []
 
     def keep(tensor: Tensor) -> Tensor:
@@ -66,7 +66,7 @@ def estimate(config: TrainConfig) -> Budget:
     hooks = torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor)
     with FlopCounterMode(display=False) as counter, hooks:
         loss, output = torch.zeros((), device="meta"), None
-        for _ in range(schedule.segment):
+        for _ in range(schedule.chunk_frames):
             output, state = network(maps, magnitude, state)
             loss = loss + output.offset.sum() + output.appearance.sum()
         loss.backward()
@@ -100,13 +100,13 @@ def check_budget(config: TrainConfig, processes: int, done: float = 0.0, images:
     if memory is not None and needed > memory:
         raise ConfigError(
             f"training ({where}) needs about {needed / 2**30:.1f} GiB, {memory / 2**30:.1f} GiB are free; "
-            f"most are activations of {config.schedule.segment} frame(s) of {config.schedule.streams} "
-            "rollout(s): lower --schedule.segment, --schedule.streams or --workers, or take --model.wiring "
-            "perframe or --preset small"
+            f"most are activations of {config.schedule.chunk_frames} frame(s) of "
+            f"{config.schedule.rollouts_per_worker} rollout(s): lower --schedule.chunk-frames, "
+            "--schedule.rollouts-per-worker or --workers, or take --model.wiring perframe or --preset small"
         )
     seconds = budget.flop / measure_flops()
     # The template's updates do not run the network.
-    share = min(1 - done, 1 - config.schedule.template_share)
+    share = min(1 - done, 1 - config.schedule.template_fraction)
     days = seconds * share * config.schedule.steps / 86400
     if config.schedule.minutes is None and days > _LONGEST_DAYS:
         raise ConfigError(

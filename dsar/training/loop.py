@@ -14,25 +14,25 @@ import numpy as np
 import torch
 from torch import nn
 
+from dsar.atomic_files import naming_storage_errors, write_text_atomically
 from dsar.avatar.avatar import Avatar
-from dsar.avatar.stillness import stillest_frames
+from dsar.avatar.rest_frames import find_rest_frames
 from dsar.config import TrainConfig, config_to_json, with_absolute_paths
-from dsar.data.capture import capture_of
-from dsar.data.multiview import MultiViewCapture
-from dsar.drafts import storing, write_whole
+from dsar.data.captures.formats import capture_of
+from dsar.data.captures.multiview import MultiViewCapture
 from dsar.errors import CaptureError, CheckpointError, ConfigError, TrainingError
 from dsar.training import checkpoint as ckpt
 from dsar.training import workers
 from dsar.training.budget import check_budget
 from dsar.training.checkpoint import Run
+from dsar.training.chunk import ChunkTrainer, UpdateMetrics
 from dsar.training.lpips import load_lpips
 from dsar.training.optimizers import make_optimizers, set_rates
 from dsar.training.registration import Registration
 from dsar.training.report import REPORT_EVERY, Monitor, Reporter
-from dsar.training.rest import RestShapes
+from dsar.training.rest import RestOffsets
 from dsar.training.scene import read_scene, scene_of_capture, write_scene
-from dsar.training.segment import Progress, SegmentTrainer
-from dsar.training.stages import Position, position
+from dsar.training.schedule import ScheduleState, schedule_at
 from dsar.types import Capture
 
 _log = logging.getLogger(__name__)
@@ -73,9 +73,9 @@ def train(config: TrainConfig, run: Run, *, resume: bool = False, report: Report
         ckpt.check_files(run)
         check_same_settings(config, resumed_settings(run, config, whole), run)
     done = ckpt.read_progress(run)["progress"] if resume else 0.0
-    check_budget(config, workers.here(config.workers), done, capture.kept_bytes)
+    check_budget(config, workers.local_count(config.workers), done, capture.kept_bytes)
     write_scene(run.scene, scene_of_capture(whole))
-    write_whole(run.config, config_to_json(config))
+    write_text_atomically(run.config, config_to_json(config))
     workers.run_workers(config.workers, _train, (config, run.folder, resume), report)
     return run
 
@@ -121,9 +121,9 @@ def _train(config: TrainConfig, folder: Path, resume: bool, report: Reporter | N
     else:
         avatar = Avatar.from_capture(capture, capture.body, config.atlas, config.model)
     lpips = load_lpips("alex") if config.loss.lpips else None
-    trainer = SegmentTrainer(config, capture, avatar.train(), training_clips(capture), lpips)
-    rest = RestShapes(avatar, still_frames(trainer, avatar.fps))
-    registration = Registration(config, capture, avatar, rest, trainer.tracks, trainer.streams.clips)
+    trainer = ChunkTrainer(config, capture, avatar.train(), training_clips(capture), lpips)
+    rest = RestOffsets(avatar, still_frames(trainer, avatar.fps))
+    registration = Registration(config, capture, avatar, rest, trainer.signals, trainer.rollouts.clips)
     schedule = registration.reduced(config.schedule)
     optimizers = make_optimizers(avatar, rest, config.schedule)
     gradients = workers.Gradients([*avatar.parameters(), *rest.parameters()])
@@ -133,9 +133,9 @@ def _train(config: TrainConfig, folder: Path, resume: bool, report: Reporter | N
         step, progress = at["step"], at["progress"]
         ckpt.load_optimizers(optimizers, run.checkpoint)
         with ckpt.reading(run.checkpoint / f"rollouts-{workers.rank()}.safetensors"):
-            trainer.carry_on(*ckpt.load_rollouts(run.checkpoint, workers.rank()))
+            trainer.load_state_dict(*ckpt.load_rollouts(run.checkpoint, workers.rank()))
         with ckpt.reading(run.checkpoint / f"registration-{workers.rank()}.safetensors"):
-            registration.carry_on(ckpt.load_registration(run.checkpoint, workers.rank()))
+            registration.load_state_dict(ckpt.load_registration(run.checkpoint, workers.rank()))
         trainer.registered = registration.result
     clock, used, stop = Clock(schedule.minutes), 0.0, False
     monitor = Monitor(run.metrics, schedule.steps, report, began=progress)
@@ -145,7 +145,7 @@ def _train(config: TrainConfig, folder: Path, resume: bool, report: Reporter | N
                 save(run, avatar, optimizers, trainer, registration, step, progress)
                 _leave(received)
                 return
-            now = position(schedule, progress)
+            now = schedule_at(schedule, progress)
             if now.stage != "template" and not registration.complete:
                 show = partial(monitor.show, step, progress, "registration")
                 stop, used = _register(registration, gradients, received, clock, used, show)
@@ -154,17 +154,17 @@ def _train(config: TrainConfig, folder: Path, resume: bool, report: Reporter | N
             set_rates(optimizers, now)
             rng = np.random.default_rng([config.seed, workers.rank(), step])
             gradients.clear()
-            done = _segment(trainer, rest, rng, now, step)
+            done = _backward(trainer, rest, rng, now, step)
             monitor.update(done)
             before, (stop, used) = used, gradients.average(bool(received), clock.used())
             if not gradients.buffer.isfinite().all():
                 raise TrainingError(f"step {step}: the gradient of {bad_gradient(avatar)} is not finite")
-            nn.utils.clip_grad_norm_(avatar.network.parameters(), config.schedule.clip)
+            nn.utils.clip_grad_norm_(avatar.network.parameters(), config.schedule.max_gradient_norm)
             for optimizer in optimizers.values():
                 optimizer.step()
             clock.start()
             step += 1
-            progress = max(step / schedule.steps, progress + (used - before) * registration.haste)
+            progress = max(step / schedule.steps, progress + (used - before) * registration.schedule_speedup)
             if workers.rank() == 0 and (step % REPORT_EVERY == 0 or progress >= 1):
                 monitor.write(step, progress, now.stage, clock.seconds())
             if progress >= 1 or step % SAVE_EVERY == 0:
@@ -177,42 +177,42 @@ def _register(
     received: list[int],
     clock: "Clock",
     before: float,
-    show: Callable[[float, Progress], None],
+    show: Callable[[float, UpdateMetrics], None],
 ) -> tuple[bool, float]:
     """Fit the registered maps; return whether a stop came before the last, and the time used so far.
 
     `before` is the time used when they were begun.
     """
     # Clocks differ by a little, but all workers must agree: only numbers that they share count.
-    began = registration.used - before
-    registration.avatar.reveal()
+    began = registration.budget_used - before
+    registration.avatar.unhide_covered_texels()
     stop, used = False, 0.0
     while not (stop or registration.complete):
-        done = registration.advance()
+        done = registration.fit_next()
         gradients.clear()
         stop, used = gradients.average(bool(received), clock.used())
-        registration.used = began + used
+        registration.budget_used = began + used
         if done is not None and registration.count % REPORT_EVERY == 0:
             show(clock.seconds(), done)
     if registration.complete:
-        registration.share()
+        registration.all_gather()
     return stop, used
 
 
-def _segment(
-    trainer: SegmentTrainer,
-    rest: RestShapes,
+def _backward(
+    trainer: ChunkTrainer,
+    rest: RestOffsets,
     rng: np.random.Generator,
-    now: Position,
+    now: ScheduleState,
     step: int,
-) -> Progress:
+) -> UpdateMetrics:
     """Compute the gradients of one update."""
     try:
         if now.stage == "template":
-            return trainer.template_segment(rng, rest, now.reduction)
-        if now.stage == "imitation":
-            return trainer.imitation_segment(rng)
-        return trainer.segment(rng, now, probe=workers.rank() == 0 and step % PROBE_EVERY == 0)
+            return trainer.backward_template(rng, rest, now.reduction)
+        if now.stage == "pretraining":
+            return trainer.backward_pretraining(rng)
+        return trainer.backward_chunk(rng, now, probe=workers.rank() == 0 and step % PROBE_EVERY == 0)
     except TrainingError as error:
         raise TrainingError(f"step {step} ({now.stage}): {error}") from error
 
@@ -224,17 +224,19 @@ def training_clips(capture: Capture) -> dict[str, range]:
         CaptureError: no camera saw any of them.
     """
     clips = {name: range(len(capture.motions[name])) for name in capture.splits["train"]}
-    if not any(capture.seen_by(name, frame) for name, clip in clips.items() for frame in clip):
+    if not any(capture.cameras_with_image(name, frame) for name, clip in clips.items() for frame in clip):
         raise CaptureError(f"capture {capture.name}: no camera has an image of a training frame")
     return clips
 
 
-def still_frames(trainer: SegmentTrainer, fps: float) -> list[tuple[str, int]]:
+def still_frames(trainer: ChunkTrainer, fps: float) -> list[tuple[str, int]]:
     """Return the near-rest training frames that the template is fitted to."""
-    clips = trainer.streams.clips
-    tracks = {name: trainer.tracks[name][: clip.stop, 0] for name, clip in clips.items()}
+    clips = trainer.rollouts.clips
+    transforms = {name: trainer.signals[name][: clip.stop, 0] for name, clip in clips.items()}
     per_sequence = max(1, -(-STILL_FRAMES // len(clips)))
-    return stillest_frames(tracks, fps, STILL_FRAMES, per_sequence, trainer.loader.capture.seen_by)
+    return find_rest_frames(
+        transforms, fps, STILL_FRAMES, per_sequence, trainer.loader.capture.cameras_with_image
+    )
 
 
 def bad_gradient(avatar: Avatar) -> str:
@@ -248,7 +250,7 @@ def save(
     run: Run,
     avatar: Avatar,
     optimizers: Mapping[str, torch.optim.Optimizer],
-    trainer: SegmentTrainer,
+    trainer: ChunkTrainer,
     registration: Registration,
     step: int,
     progress: float,
@@ -259,15 +261,15 @@ def save(
         StorageError: the system does not take it; the checkpoint before it stays.
     """
     folder = run.folder / "checkpoint.tmp"
-    with storing(run.checkpoint), _removed_on_failure(folder):
+    with naming_storage_errors(run.checkpoint), _removed_on_failure(folder):
         if workers.rank() == 0:
             shutil.rmtree(folder, ignore_errors=True)
             folder.mkdir()
             ckpt.save_avatar(avatar, folder)
             ckpt.save_optimizers(optimizers, folder)
         workers.barrier()
-        ckpt.save_rollouts(folder, workers.rank(), *trainer.carried())
-        ckpt.save_registration(folder, workers.rank(), registration.carried())
+        ckpt.save_rollouts(folder, workers.rank(), *trainer.state_dict())
+        ckpt.save_registration(folder, workers.rank(), registration.state_dict())
         workers.barrier()
         if workers.rank() == 0:
             ckpt.save_progress(folder, step, progress, run)

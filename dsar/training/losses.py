@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
+from dsar.avatar.input_maps import REFERENCE_FPS
 from dsar.config import LossConfig
 from dsar.network import NetworkOutput
-from dsar.network.maps import FPS
 from dsar.training.fused_loss import fused_image_loss
 from dsar.training.targets import Target
 from dsar.types import RenderOutput
@@ -93,11 +93,11 @@ def image_loss(
     return loss, (output.color - truth).detach().square().mean()
 
 
-def spatial_loss(offsets: Float[Tensor, "b p 3"], links: Int64[Tensor, "l 2"]) -> Float[Tensor, ""]:
-    """Return the mean squared difference, in cm, of the offsets of linked points; 0 without links."""
-    if not len(links):
+def spatial_loss(offsets: Float[Tensor, "b p 3"], edges: Int64[Tensor, "l 2"]) -> Float[Tensor, ""]:
+    """Return the mean squared difference, in cm, of the offsets of neighbouring points; 0 without edges."""
+    if not len(edges):
         return offsets.new_zeros(())
-    change = (offsets[:, links[:, 0]] - offsets[:, links[:, 1]]) * CENTIMETRES
+    change = (offsets[:, edges[:, 0]] - offsets[:, edges[:, 1]]) * CENTIMETRES
     return change.square().sum(2).mean()
 
 
@@ -178,7 +178,7 @@ def _weight(
     frames = [frame] if config.magnitude == "frame" else range(-len(speeds), 0)
     # What came before a rollout's restart is another motion.
     seen = [speeds[k] * _have_seen(ages, -1 - k, speeds[k])[:, None, None, None] for k in frames]
-    return torch.exp(-torch.stack(seen).amax(0) * FPS / config.still_speed)
+    return torch.exp(-torch.stack(seen).amax(0) * REFERENCE_FPS / config.tau)
 
 
 def _have_seen(ages: list[int], past: int, like: Tensor) -> Float[Tensor, " b"]:

@@ -7,8 +7,8 @@ import torch
 from dsar.avatar.avatar import Avatar
 from dsar.config import ScheduleConfig
 from dsar.training.muon import Muon
-from dsar.training.rest import RestShapes
-from dsar.training.stages import Position
+from dsar.training.rest import RestOffsets
+from dsar.training.schedule import ScheduleState
 
 _TEMPLATE_RATES = {
     "means": 1e-3,
@@ -26,13 +26,13 @@ _REST_RATE = 3e-3
 
 
 def make_optimizers(
-    avatar: Avatar, rest: RestShapes, schedule: ScheduleConfig
+    avatar: Avatar, rest: RestOffsets, schedule: ScheduleConfig
 ) -> Mapping[str, torch.optim.Optimizer]:
     """Return Muon for the network's hidden convolutions and Adam for all else; rates are set each update.
 
     Adam's epsilon is far below the default: inner gradients of this network are smaller than 1e-8.
     """
-    hidden = avatar.network.hidden_weights() if schedule.matrix_rate else []
+    hidden = avatar.network.hidden_weights() if schedule.muon_rate else []
     chosen = {id(weight) for weight in hidden}
     others = [p for p in avatar.network.parameters() if id(p) not in chosen]
     groups = [{"params": others, "name": "network"}]
@@ -42,7 +42,7 @@ def make_optimizers(
     return {"adam": adam} | ({"muon": Muon(hidden)} if hidden else {})
 
 
-def set_rates(optimizers: Mapping[str, torch.optim.Optimizer], now: Position) -> None:
+def set_rates(optimizers: Mapping[str, torch.optim.Optimizer], now: ScheduleState) -> None:
     """Set the learning rates of this update."""
     fitting = now.stage == "template"
     rates = {name: rate * now.template_factor for name, rate in _TEMPLATE_RATES.items()}
@@ -52,4 +52,4 @@ def set_rates(optimizers: Mapping[str, torch.optim.Optimizer], now: Position) ->
         group["lr"] = rates[group["name"]]
     if "muon" in optimizers:
         for group in optimizers["muon"].param_groups:
-            group["lr"] = now.matrix_rate
+            group["lr"] = now.muon_rate

@@ -14,14 +14,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dsar.avatar.avatar import Avatar, blend
+from dsar.avatar.avatar import Avatar, blend_bone_transforms
 from dsar.config import ScheduleConfig, TrainConfig
 from dsar.geometry.cameras import project
 from dsar.raster import rasterize, reduced_dilation
 from dsar.training import workers
+from dsar.training.chunk import UpdateMetrics
 from dsar.training.losses import image_loss, spatial_loss
-from dsar.training.rest import RestShapes
-from dsar.training.segment import Progress
+from dsar.training.rest import RestOffsets
 from dsar.training.targets import Target, load_target
 from dsar.types import Capture
 
@@ -58,30 +58,32 @@ class Registration:
         config: TrainConfig,
         capture: Capture,
         avatar: Avatar,
-        rest: RestShapes,
-        tracks: Mapping[str, Float[Tensor, "_ t j 4 4"]],
+        rest: RestOffsets,
+        signals: Mapping[str, Float[Tensor, "_ t j 4 4"]],
         clips: Mapping[str, range],
     ) -> None:
         """Prepare to fit the frames of `clips`, of which each worker gets its share."""
-        self.capture, self.avatar, self.tracks, self.seed = capture, avatar, tracks, config.seed
+        self.capture, self.avatar, self.signals, self.seed = capture, avatar, signals, config.seed
         self.rest = rest
         self.schedule = config.schedule
         self.loss = dataclasses.replace(config.loss, **STRUCTURE)
-        self.garment = avatar.garment_points()
-        wanted = clips if config.schedule.imitation_share and len(self.garment) else {}
-        shares = share_out(wanted, workers.count())
+        self.garment = avatar.garment_control_points()
+        wanted = clips if config.schedule.pretraining_fraction and len(self.garment) else {}
+        shares = divide_sequences(wanted, workers.world_size())
         self.longest = max(sum(len(clips[name]) for name in share) for share in shares)
-        self.places = [(name, frame) for name in shares[workers.rank()] for frame in clips[name]]
+        self.frames = [(name, frame) for name in shares[workers.rank()] for frame in clips[name]]
         self.starts = {name: clip.start for name, clip in wanted.items()}
         self.order = list(clips)
         self.count = 0
         """Frames fitted by the busiest worker."""
-        self.used = 0.0
+        self.budget_used = 0.0
         """Share of the budget of time that was used."""
-        self.offsets = {name: torch.zeros(len(tracks[name]), len(avatar.cells), 3) for name in wanted}
+        self.offsets = {
+            name: torch.zeros(len(signals[name]), len(avatar.control_cells), 3) for name in wanted
+        }
         self.fitted = {name: torch.zeros((), dtype=torch.int64) for name in wanted}
         self.unseen = {
-            name: frozenset(frame for frame in clip if not capture.seen_by(name, frame))
+            name: frozenset(frame for frame in clip if not capture.cameras_with_image(name, frame))
             for name, clip in wanted.items()
         }
         """Frames that no camera saw: their maps carry the cloth on and teach nothing."""
@@ -89,7 +91,7 @@ class Registration:
     @property
     def complete(self) -> bool:
         """Whether every worker has fitted its frames, or time is up."""
-        return self.count >= self.longest or self.used >= LIMIT
+        return self.count >= self.longest or self.budget_used >= LIMIT
 
     @property
     def result(self) -> dict[str, tuple[Collection[int], Float[Tensor, "_ p 3"]]]:
@@ -99,49 +101,49 @@ class Registration:
         return {name: (frames[name], maps) for name, maps in self.offsets.items() if frames[name]}
 
     @property
-    def haste(self) -> float:
+    def schedule_speedup(self) -> float:
         """Factor by which the stages after it must advance faster than time for what it took."""
-        left = 1 - self.schedule.template_share
-        return left / (left - self.used) if self.complete else 1.0
+        left = 1 - self.schedule.template_fraction
+        return left / (left - self.budget_used) if self.complete else 1.0
 
     def reduced(self, schedule: ScheduleConfig) -> ScheduleConfig:
-        """Return the schedule, without imitation where there is no garment to imitate."""
-        return schedule if self.offsets else dataclasses.replace(schedule, imitation_share=0.0)
+        """Return the schedule, without pre-training where there is no garment to register."""
+        return schedule if self.offsets else dataclasses.replace(schedule, pretraining_fraction=0.0)
 
-    def share(self) -> None:
+    def all_gather(self) -> None:
         """Give all workers what each has fitted."""
-        workers.add_up([*self.offsets.values(), *self.fitted.values()])
-        self.count, self.places = self.longest, []
+        workers.all_reduce([*self.offsets.values(), *self.fitted.values()])
+        self.count, self.frames = self.longest, []
 
-    def carried(self) -> dict[str, Tensor]:
+    def state_dict(self) -> dict[str, Tensor]:
         """Return what must survive a restart."""
         tensors = {f"offsets.{name}": maps for name, maps in self.offsets.items()}
         tensors |= {f"fitted.{name}": fitted for name, fitted in self.fitted.items()}
         tensors["rest"] = self.rest.offsets.detach()
-        return tensors | {"count": torch.tensor(self.count), "used": torch.tensor(self.used)}
+        return tensors | {"count": torch.tensor(self.count), "used": torch.tensor(self.budget_used)}
 
-    def carry_on(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restore what `carried` returned."""
+    def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
+        """Restore what `state_dict` returned."""
         self.offsets = {name: tensors[f"offsets.{name}"] for name in self.offsets}
         self.fitted = {name: tensors[f"fitted.{name}"] for name in self.fitted}
         with torch.no_grad():
             self.rest.offsets.copy_(tensors["rest"])
-        self.count, self.used = int(tensors["count"]), float(tensors["used"])
+        self.count, self.budget_used = int(tensors["count"]), float(tensors["used"])
 
-    def advance(self) -> Progress | None:
+    def fit_next(self) -> UpdateMetrics | None:
         """Fit this worker's next frame, if it has one left."""
-        place = self.places[self.count] if self.count < len(self.places) else None
+        place = self.frames[self.count] if self.count < len(self.frames) else None
         self.count += 1
         return self.fit(*place) if place is not None else None
 
-    def fit(self, name: str, frame: int) -> Progress | None:
+    def fit(self, name: str, frame: int) -> UpdateMetrics | None:
         """Fit the map of a frame; those before it are fitted. Cloth that no camera saw stays as it was."""
         rng = np.random.default_rng([self.seed, self.order.index(name), frame])
-        context = self.tracks[name][[frame]]
-        guesses, fast = self._guesses(context, name, frame)
-        points = self._posed(context, guesses[0])
+        motion_window = self.signals[name][[frame]]
+        guesses, fast = self._guesses(motion_window, name, frame)
+        points = self._posed(motion_window, guesses[0])
         view = functools.cache(functools.partial(self._view, name, frame, points=points))
-        cameras = self.capture.seen_by(name, frame)
+        cameras = self.capture.cameras_with_image(name, frame)
         if not cameras:
             if frame > self.starts[name]:
                 self.offsets[name][frame] = self.offsets[name][frame - 1]
@@ -152,66 +154,68 @@ class Registration:
             count = min(FAST_VIEWS if fast else VIEWS, len(cameras))
             return [view(int(k)) for k in rng.choice(cameras, count, replace=False)]
 
-        guess = self._best(context, guesses, some_views())
+        guess = self._best(motion_window, guesses, some_views())
         offset = guess.clone().requires_grad_()
         optimizer = torch.optim.Adam([offset], FAST_RATE if fast else RATE, betas=(0.8, 0.9))
         loss, mse = torch.zeros(()), torch.zeros(())
         for _ in range(STEPS):
             optimizer.zero_grad()
-            loss, mse = self._compare(context, offset, some_views(), rng.random(3))
+            loss, mse = self._compare(motion_window, offset, some_views(), rng.random(3))
             loss = loss + JOLT * self._roughness(offset - guess)
             loss.backward(inputs=[offset])
             optimizer.step()
         self.offsets[name][frame, self.garment] = offset.detach()
         self.fitted[name] += 1
-        return Progress(float(loss.detach()), float(mse))
+        return UpdateMetrics(float(loss.detach()), float(mse))
 
     @torch.no_grad()
     def _best(
-        self, context: Tensor, guesses: list[Float[Tensor, "g 3"]], views: list[tuple[Target, float]]
+        self, motion_window: Tensor, guesses: list[Float[Tensor, "g 3"]], views: list[tuple[Target, float]]
     ) -> Float[Tensor, "g 3"]:
         """Return the guess that the views like best."""
-        losses = [self._compare(context, guess, views, np.full(3, 0.5))[0] for guess in guesses]
+        losses = [self._compare(motion_window, guess, views, np.full(3, 0.5))[0] for guess in guesses]
         return guesses[int(torch.stack(losses).argmin())]
 
     @torch.no_grad()
-    def _guesses(self, context: Tensor, name: str, frame: int) -> tuple[list[Float[Tensor, "g 3"]], bool]:
+    def _guesses(
+        self, motion_window: Tensor, name: str, frame: int
+    ) -> tuple[list[Float[Tensor, "g 3"]], bool]:
         """Return offsets to start from, and whether the cloth is fast.
 
         Rest is among them, so that a print that was lost is found again when the cloth comes to rest.
         """
         garment, seen = self.garment, frame - self.starts[name]
-        rest = self.rest.first(name)
+        rest = self.rest.earliest(name)
         if seen == 0:
             return [rest], False
         before = self.offsets[name][frame - 1, garment]
         if seen == 1:
             return [before, rest], False
-        change = self._inertia(context, name, frame) - before
+        change = self._inertia(motion_window, name, frame) - before
         norm = change.norm(dim=1, keepdim=True)
         change = change * norm / (norm + NOISE)
         fast = bool(norm.mean() > FAST)
         return [before + stride * change for stride in (STRIDES if fast else (1.0,))] + [rest], fast
 
-    def _inertia(self, context: Tensor, name: str, frame: int) -> Float[Tensor, "g 3"]:
+    def _inertia(self, motion_window: Tensor, name: str, frame: int) -> Float[Tensor, "g 3"]:
         """Return the offsets of cloth that moves on through the world as it did before this frame."""
-        avatar, garment, track = self.avatar, self.garment, self.tracks[name]
+        avatar, garment, signal = self.avatar, self.garment, self.signals[name]
         past = self.offsets[name]
-        newest, older = (self._posed(track[[f]], past[f, garment]) for f in (frame - 1, frame - 2))
+        newest, older = (self._posed(signal[[f]], past[f, garment]) for f in (frame - 1, frame - 2))
         moved = newest + self._smooth(newest - older)
-        blended = blend(avatar.control_weights[garment], context[:, :1])[0, 0]
+        blended = blend_bone_transforms(avatar.control_weights[garment], motion_window[:, :1])[0, 0]
         points = torch.linalg.solve(blended[..., :3], (moved - blended[..., 3])[..., None])[..., 0]
         return (avatar.control_axes[garment] * (points - avatar.control_points[garment])[..., None]).sum(1)
 
     def _compare(
         self,
-        context: Tensor,
+        motion_window: Tensor,
         offset: Float[Tensor, "g 3"],
         views: list[tuple[Target, float]],
         background: np.ndarray,
     ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
         """Return loss and squared error of views over a background, and how far neighbours part."""
-        gaussians = self.avatar.gaussians(context, self.avatar.offset_garment(offset[None]))[0]
+        gaussians = self.avatar.gaussians(motion_window, self.avatar.offset_garment(offset[None]))[0]
         color = torch.from_numpy(background.astype(np.float32))
         loss, mse = torch.zeros(()), torch.zeros(())
         for target, share in views:
@@ -223,7 +227,7 @@ class Registration:
         return loss + ROUGHNESS * self._roughness(offset), mse
 
     def _roughness(self, offset: Float[Tensor, "g 3"]) -> Float[Tensor, ""]:
-        return spatial_loss(self.avatar.among_points(offset[None]), self.avatar.links)
+        return spatial_loss(self.avatar.scatter_garment_points(offset[None]), self.avatar.surface_edges)
 
     def _view(self, name: str, frame: int, camera: int, points: Float[Tensor, "g 3"]) -> tuple[Target, float]:
         """Return a view of the garment around its points in the world, and its share of the person's view."""
@@ -237,23 +241,23 @@ class Registration:
         part = Target(color, alpha, target.camera.cropped(x0, y0, x1 - x0, y1 - y0))
         return part, alpha.numel() / target.alpha.numel()
 
-    def _posed(self, context: Tensor, offset: Float[Tensor, "g 3"]) -> Float[Tensor, "g 3"]:
+    def _posed(self, motion_window: Tensor, offset: Float[Tensor, "g 3"]) -> Float[Tensor, "g 3"]:
         """Return where the garment's control points are in the world."""
         output = self.avatar.offset_garment(offset[None])
-        return self.avatar.deformed_control_points(context, output)[0, self.garment]
+        return self.avatar.deformed_control_points(motion_window, output)[0, self.garment]
 
     def _smooth(self, vectors: Float[Tensor, "g 3"]) -> Float[Tensor, "g 3"]:
         """Return the mean of each control point of the garment and its neighbours."""
         avatar = self.avatar
-        spread = torch.zeros(len(avatar.cells), 4)
+        spread = torch.zeros(len(avatar.control_cells), 4)
         spread[self.garment] = torch.cat([vectors, torch.ones(len(vectors), 1)], 1)
         total = spread.clone()
-        for a, b in (avatar.links.T, avatar.links.T.flip(0)):
+        for a, b in (avatar.surface_edges.T, avatar.surface_edges.T.flip(0)):
             total.index_add_(0, a, spread[b])
         return (total[:, :3] / total[:, 3:].clamp_min(1))[self.garment]
 
 
-def share_out(clips: Mapping[str, range], workers: int) -> list[list[str]]:
+def divide_sequences(clips: Mapping[str, range], workers: int) -> list[list[str]]:
     """Return which sequences each worker gets, so that none has much more to do than another."""
     shares: list[list[str]] = [[] for _ in range(workers)]
     for name in sorted(clips, key=lambda name: -len(clips[name])):

@@ -9,8 +9,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from dsar.drafts import storing
-from dsar.training.segment import Progress
+from dsar.atomic_files import naming_storage_errors
+from dsar.training.chunk import UpdateMetrics
 
 _log = logging.getLogger(__name__)
 REPORT_EVERY = 20
@@ -53,10 +53,10 @@ class Monitor:
     def __init__(self, metrics: Path, steps: int, reporter: Reporter | None, *, began: float = 0.0) -> None:
         """Write to `metrics` and tell `reporter`; `began` is the progress with which this process began."""
         self._metrics, self._steps, self._reporter, self._began = metrics, steps, reporter, began
-        self._smoothed: Progress | None = None
+        self._smoothed: UpdateMetrics | None = None
         self._warned: set[str] = set()
 
-    def update(self, done: Progress) -> None:
+    def update(self, done: UpdateMetrics) -> None:
         """Take in one update; say once of each regulariser that it moves nothing, or more than images do."""
         self._smoothed = _smooth(self._smoothed, done)
         for name, share in (done.gradients or {}).items():
@@ -69,7 +69,7 @@ class Monitor:
         """Append a line of smoothed values to metrics.jsonl and show it to the listener."""
         assert self._smoothed is not None
         line = self._line(step, progress, stage, seconds, self._smoothed)
-        with storing(self._metrics), self._metrics.open("ab+") as file:
+        with naming_storage_errors(self._metrics), self._metrics.open("ab+") as file:
             # What a killed run has left of a line stays one by itself.
             whole = file.tell() == 0 or (file.seek(-1, os.SEEK_END) >= 0 and file.read(1) == b"\n")
             file.write(
@@ -78,19 +78,19 @@ class Monitor:
         if self._reporter is not None:
             self._reporter(line)
 
-    def show(self, step: int, progress: float, stage: str, seconds: float, done: Progress) -> None:
+    def show(self, step: int, progress: float, stage: str, seconds: float, done: UpdateMetrics) -> None:
         """Show the listener work that counts as no update."""
         if self._reporter is not None:
             self._reporter(self._line(step, progress, stage, seconds, done))
 
-    def _line(self, step: int, progress: float, stage: str, seconds: float, done: Progress) -> Report:
+    def _line(self, step: int, progress: float, stage: str, seconds: float, done: UpdateMetrics) -> Report:
         psnr = -10 * math.log10(max(done.mse or 0.0, 1e-10))
         gained = progress - self._began
         left = seconds * (1 - progress) / gained if gained > 0 else None
         return Report(step, self._steps, progress, stage, done.loss, psnr, seconds, left, done.gradients)
 
 
-def _smooth(before: Progress | None, now: Progress) -> Progress:
+def _smooth(before: UpdateMetrics | None, now: UpdateMetrics) -> UpdateMetrics:
     if before is None:
         return now
     # An update without images keeps what the last images said.
@@ -98,4 +98,4 @@ def _smooth(before: Progress | None, now: Progress) -> Progress:
     if now.mse is not None and before.mse is not None:
         mse = (1 - _NEW) * before.mse + _NEW * now.mse
     gradients = before.gradients if now.gradients is None else now.gradients
-    return Progress((1 - _NEW) * before.loss + _NEW * now.loss, mse, gradients)
+    return UpdateMetrics((1 - _NEW) * before.loss + _NEW * now.loss, mse, gradients)

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from dsar.avatar.avatar import Avatar, surface_links
+from dsar.avatar.avatar import Avatar, find_surface_edges
 from dsar.config import LossConfig
 from dsar.network import NetworkOutput
 from dsar.training.losses import CENTIMETRES, spatial_loss
@@ -18,27 +18,27 @@ PULL = 1e-4
 """Weight of the squared offset, cm: what all frames share is the template's."""
 
 
-class RestShapes(nn.Module):
+class RestOffsets(nn.Module):
     """Offsets of the garment in each still frame; empty where there is no garment."""
 
     def __init__(self, avatar: Avatar, frames: list[tuple[str, int]]) -> None:
         super().__init__()
         self.frames = frames
         """Sequence and frame of each shape."""
-        self.offsets = nn.Parameter(torch.zeros(len(frames), len(avatar.garment_points()), 3))
+        self.offsets = nn.Parameter(torch.zeros(len(frames), len(avatar.garment_control_points()), 3))
         """Offsets of the garment's control points along their axes, metres."""
         self._garment = avatar.garment_texels()
         self._chart = avatar.texel_positions[self._garment]
         cells = avatar.texels[self._garment]
-        self._links = (
-            surface_links(cells, avatar.atlas_size, self._chart) if len(cells) else cells.reshape(0, 2)
+        self._edges = (
+            find_surface_edges(cells, avatar.atlas_size, self._chart) if len(cells) else cells.reshape(0, 2)
         )
 
     def output(self, avatar: Avatar, index: int) -> NetworkOutput:
         """Return the output that gives the garment the shape it has in one of the frames."""
         return avatar.offset_garment(self.offsets[[index]])
 
-    def first(self, sequence: str) -> Float[Tensor, "g 3"]:
+    def earliest(self, sequence: str) -> Float[Tensor, "g 3"]:
         """Return the offsets in the earliest still frame of a sequence, zeros if it has none."""
         frames = [(frame, index) for index, (name, frame) in enumerate(self.frames) if name == sequence]
         if not frames:
@@ -50,6 +50,6 @@ class RestShapes(nn.Module):
         if not len(self._garment):
             return self.offsets.new_zeros(())
         moved = (avatar.template.means[self._garment] - self._chart)[None]
-        together = spatial_loss(avatar.among_points(self.offsets), avatar.links)
+        together = spatial_loss(avatar.scatter_garment_points(self.offsets), avatar.surface_edges)
         pull = (self.offsets * CENTIMETRES).square().sum(-1).mean()
-        return config.shape * spatial_loss(moved, self._links) + config.spatial * together + PULL * pull
+        return config.shape * spatial_loss(moved, self._edges) + config.spatial * together + PULL * pull

@@ -15,11 +15,11 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from dsar.atomic_files import atomic_write
 from dsar.body.model import JOINT_NAMES
 from dsar.config import EMBEDDED, TrainConfig
-from dsar.data.capture import capture_of
-from dsar.data.multiview import MultiViewCapture
-from dsar.drafts import replacing
+from dsar.data.captures.formats import capture_of
+from dsar.data.captures.multiview import MultiViewCapture
 from dsar.errors import CheckpointError
 from dsar.training.checkpoint import Run, reading
 from dsar.types import Camera, Motion
@@ -120,7 +120,7 @@ def write_scene(path: Path, scene: Scene) -> None:
         key: tensor.detach().cpu().clone(memory_format=torch.contiguous_format)
         for key, tensor in tensors.items()
     }
-    with replacing(path) as draft:
+    with atomic_write(path) as draft:
         save_file(own, draft, {"scene": json.dumps(record)})
 
 

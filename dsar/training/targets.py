@@ -52,11 +52,11 @@ class TargetLoader:
         self.capture = capture
         self._threads = ThreadPoolExecutor(threads, "targets")
 
-    def ask(
+    def request(
         self, rng: np.random.Generator, sequence: str, frame: int, reduction: int, count: int
     ) -> list[Future[Target]]:
         """Begin to load some of the views of a frame, as many as there are at most."""
-        seen = self.capture.seen_by(sequence, frame)
+        seen = self.capture.cameras_with_image(sequence, frame)
         chosen = rng.choice(seen, min(count, len(seen)), replace=False) if seen else ()
         return [
             self._threads.submit(load_target, self.capture, sequence, frame, int(index), reduction)

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from dsar.errors import DsarError, TrainingError
 
-TIMELY = 2
+EXTRA_NUMBERS = 2
 """Extra numbers that travel with the gradients: a request to stop, and the share of the budget used."""
 _BACKEND = "gloo"
 _LAST_WORDS_S, _FAREWELL_S = 5.0, 30.0
@@ -32,7 +32,7 @@ class Gradients:
     """One flat buffer that holds all gradients of a list of parameters, summed over workers at once."""
 
     def __init__(self, parameters: list[nn.Parameter]) -> None:
-        self.buffer = torch.zeros(sum(p.numel() for p in parameters) + TIMELY)
+        self.buffer = torch.zeros(sum(p.numel() for p in parameters) + EXTRA_NUMBERS)
         offset = 0
         for parameter in parameters:
             view = self.buffer[offset : offset + parameter.numel()]
@@ -54,7 +54,7 @@ class Gradients:
             dist.all_reduce(self.buffer)
         stopped, share = bool(self.buffer[-2] > 0), float(self.buffer[-1])
         if dist.is_initialized():
-            self.buffer /= count()
+            self.buffer /= world_size()
         return stopped, share
 
 
@@ -63,14 +63,14 @@ def rank() -> int:
     return dist.get_rank() if dist.is_initialized() else 0
 
 
-def count() -> int:
+def world_size() -> int:
     """Return the number of workers."""
     return dist.get_world_size() if dist.is_initialized() else 1
 
 
-def here(wanted: int) -> int:
-    """Return how many workers this machine will have: those that torchrun made, else as many as wanted."""
-    return int(os.environ.get("LOCAL_WORLD_SIZE", wanted))
+def local_count(requested: int) -> int:
+    """Return how many workers this machine will have: those that torchrun made, else as many as requested."""
+    return int(os.environ.get("LOCAL_WORLD_SIZE", requested))
 
 
 def barrier() -> None:
@@ -79,7 +79,7 @@ def barrier() -> None:
         dist.barrier()
 
 
-def add_up(tensors: Iterable[Tensor]) -> None:
+def all_reduce(tensors: Iterable[Tensor]) -> None:
     """Replace each tensor by its sum over workers."""
     if dist.is_initialized():
         for tensor in tensors:

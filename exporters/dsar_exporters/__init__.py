@@ -5,11 +5,11 @@ imported when a writer runs, never before. Frame numbers are the same in every f
 mix of formats from one rollout.
 """
 
-from dsar_exporters.delivery import Delivered, Output, export
+from dsar_exporters.delivery import Delivery, Output, export
 from dsar_exporters.exr import ColorTarget, ExrSequence, exr_path, ocio_config, write_exr
 from dsar_exporters.frames import parse_frames
 from dsar_exporters.inspection import find_faults
-from dsar_exporters.projections import written_projections
+from dsar_exporters.projections import read_back_projections
 from dsar_exporters.splats import (
     CompressedPlySequence,
     GltfSnapshot,
@@ -24,7 +24,7 @@ from dsar_exporters.usd import UsdAsset, list_usd_cameras, read_usd_cameras, wri
 __all__ = [
     "ColorTarget",
     "CompressedPlySequence",
-    "Delivered",
+    "Delivery",
     "ExrSequence",
     "GltfSnapshot",
     "Output",
@@ -37,11 +37,11 @@ __all__ = [
     "list_usd_cameras",
     "ocio_config",
     "parse_frames",
+    "read_back_projections",
     "read_ply",
     "read_splats",
     "read_usd_cameras",
     "write_exr",
     "write_ply",
     "write_usd",
-    "written_projections",
 ]

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from dsar.drafts import storing
+from dsar.atomic_files import naming_storage_errors
 from dsar.errors import DsarError, ExportError
 from dsar.types import Gaussians, GaussianSequence
 from dsar_exporters.checks import check_sequence, checked_frames
@@ -50,7 +50,7 @@ class Output(Protocol):
 
 
 @dataclass(frozen=True)
-class Delivered:
+class Delivery:
     """What was written of one output."""
 
     path: Path
@@ -76,12 +76,12 @@ class _Timed:
 
     def write(self, frame: int, gaussians: Gaussians) -> None:
         """Write a frame."""
-        with self._counted(), storing(self.output.path):
+        with self._counted(), naming_storage_errors(self.output.path):
             self._sink(frame, gaussians)
 
     def close(self) -> None:
         """Put the files in their place."""
-        with self._counted(), storing(self.output.path):
+        with self._counted(), naming_storage_errors(self.output.path):
             self._opened.__exit__(None, None, None)
 
     @contextmanager
@@ -91,7 +91,7 @@ class _Timed:
         self.seconds += time.perf_counter() - began
 
 
-def export(sequence: GaussianSequence, outputs: Sequence[Output]) -> list[Delivered]:
+def export(sequence: GaussianSequence, outputs: Sequence[Output]) -> list[Delivery]:
     """Write every output from one pass over a sequence, and return what was written of each.
 
     Before anything is written, the log says how large the files will be; after eight frames, how long it will
@@ -115,7 +115,7 @@ def export(sequence: GaussianSequence, outputs: Sequence[Output]) -> list[Delive
         for output in outputs:
             sink = _Timed(output)
             sinks.append(sink)
-            with storing(output.path):
+            with naming_storage_errors(output.path):
                 # Whatever happens before all frames have passed, happens to every output.
                 stack.push(sink.open(sequence))
         began = time.perf_counter()
@@ -131,7 +131,7 @@ def export(sequence: GaussianSequence, outputs: Sequence[Output]) -> list[Delive
     return _close(sinks)
 
 
-def _close(sinks: Sequence["_Timed"]) -> list[Delivered]:
+def _close(sinks: Sequence["_Timed"]) -> list[Delivery]:
     """Put the files of every output in their place, also where another's cannot be."""
     found, errors = [], []
     for sink in sinks:
@@ -142,7 +142,7 @@ def _close(sinks: Sequence["_Timed"]) -> list[Delivered]:
             continue
         files = sink.output.written()
         size = sum(file.stat().st_size for file in files)
-        delivered = Delivered(sink.output.path, len(files), size, sink.seconds)
+        delivered = Delivery(sink.output.path, len(files), size, sink.seconds)
         rate = size / _MEGA / max(delivered.seconds, 1e-9)
         _logger.info(
             "%s: %.1f MB in %d files, %.1f s (%.0f MB/s)",

@@ -8,7 +8,7 @@ from typing import Any
 
 from fileseq.frameset import FrameSet
 
-from dsar.drafts import replacing
+from dsar.atomic_files import atomic_write
 from dsar.types import GaussianSequence
 
 _PACKAGES = ("dsar-avatar", "torch", "usd-core", "plyfile", "gsply", "fourdgs")
@@ -50,7 +50,7 @@ def write_manifest(
         "files": [file.absolute().relative_to(path.absolute().parent).as_posix() for file in files],
     }
     target = manifest_path(path)
-    with replacing(target) as draft:
+    with atomic_write(target) as draft:
         draft.write_text(json.dumps(content, indent=2) + "\n")
     return target
 

@@ -20,7 +20,7 @@ Projections = dict[str, Float[np.ndarray, "4 4"]]
 _FRAME, _FPS = 1001, 24.0
 
 
-def written_projections(cameras: Sequence[Camera]) -> dict[str, Projections]:
+def read_back_projections(cameras: Sequence[Camera]) -> dict[str, Projections]:
     """Write cameras to a USD asset and to EXR images, and return how those project, by format.
 
     `usd`: the stage's frustums. `exr`: worldToNDC. `exr_lens`: worldToCamera and the lens.

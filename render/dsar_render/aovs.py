@@ -18,7 +18,7 @@ from dsar_render.labels import Labels
 
 Aov = Literal["rgba", "alpha", "Z", "N", "P", "motion", "id", "crypto"]
 AOVS: tuple[Aov, ...] = get_args(Aov)
-DRAWN: dict[str, Output] = {"Z": "front_depth", "id": "heaviest"}
+RASTER_OUTPUTS: dict[str, Output] = {"Z": "first_hit_depth", "id": "largest_weight_id"}
 """What the rasteriser itself is asked for."""
 
 

@@ -11,7 +11,7 @@ from PIL import Image, UnidentifiedImageError
 from PIL.PngImagePlugin import PngInfo
 from torch import Tensor
 
-from dsar.drafts import replacing
+from dsar.atomic_files import atomic_write
 from dsar.types import Camera, Picture, RenderOutput
 
 # Below this coverage an 8-bit alpha is zero and a straight colour is noise.
@@ -55,7 +55,7 @@ class PngSequence:
         """Write a frame's pictures; `jobs` are hashes of all that their files depend on."""
         paths = [self._path(picture.frame, picture.camera.name) for picture in pictures]
         for path, picture, job in zip(paths, pictures, jobs, strict=True):
-            write_png(delivered(picture), path, job=job)
+            write_png(crop_overscan(picture), path, job=job)
         return paths
 
     def complete(self, frame: int, cameras: Sequence[str], jobs: Sequence[str], deep: bool) -> bool:
@@ -80,14 +80,14 @@ def write_png(output: RenderOutput, path: Path, *, job: str = "") -> Path:
     color, alpha = output.color.detach().cpu().numpy(), output.alpha.detach().cpu().numpy()
     coverage = alpha[..., None]
     straight = np.divide(color, coverage, out=np.zeros_like(color), where=coverage >= _MIN_ALPHA)
-    with replacing(path) as draft:
+    with atomic_write(path) as draft:
         Image.fromarray(_quantized(np.concatenate([straight, coverage], -1))).save(
             draft, format="PNG", pnginfo=text
         )
     return path
 
 
-def delivered(picture: Picture) -> RenderOutput:
+def crop_overscan(picture: Picture) -> RenderOutput:
     """Return the camera's own view: a PNG has no pixels beyond it."""
     margin, output = picture.overscan, picture.output
     if not margin:

@@ -32,7 +32,7 @@ class Labels:
     """Their indices."""
 
 
-def labels_of(sequence: GaussianSequence) -> Labels:
+def label_sequence(sequence: GaussianSequence) -> Labels:
     """Return the parts of the body that a sequence's Gaussians belong to.
 
     Raises:

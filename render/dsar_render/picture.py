@@ -14,13 +14,13 @@ from jaxtyping import Float
 
 from dsar.color import linear_from_srgb, srgb_from_linear
 from dsar.errors import ConfigError
-from dsar.geometry.paths import CameraPath
+from dsar.geometry.camera_paths import CameraPath
 from dsar.raster import Output, rasterize
 from dsar.types import Camera, Picture, RenderOutput
-from dsar_render.aovs import AOVS, DRAWN, Moment, cover, make_aovs
+from dsar_render.aovs import AOVS, RASTER_OUTPUTS, Moment, cover, make_aovs
 from dsar_render.deep import sample_deep
-from dsar_render.instants import Instant
 from dsar_render.labels import Labels
+from dsar_render.triplets import FrameTriplet
 
 _MIN_ALPHA = 1e-6
 """Below this coverage a colour has no digits left."""
@@ -90,8 +90,8 @@ class RenderSettings:
         return "motion" in self.aovs or any(self.times)
 
 
-def take_picture(
-    instant: Instant,
+def render_picture(
+    triplet: FrameTriplet,
     path: CameraPath,
     settings: RenderSettings,
     *,
@@ -104,33 +104,33 @@ def take_picture(
     Everything but colour, alpha and coverage is that of the frame itself, sharp, whatever the shutter does.
 
     Args:
-        instant: The frame; with its neighbours if `settings.needs_neighbours`.
+        triplet: The frame; with its neighbours if `settings.needs_neighbours`.
         path: The camera.
         settings: What is wanted.
         labels: Parts of the Gaussians; for `crypto`.
         fps: Frames per second.
         provenance: Written into files of the picture.
     """
-    view = path.at(instant.frame)
-    now = Moment(instant.now, _widened(view, settings.overscan))
+    view = path.at(triplet.frame)
+    now = Moment(triplet.now, _widened(view, settings.overscan))
     wanted = set(settings.aovs)
-    drawn: list[Output] = [output for name, output in DRAWN.items() if name in wanted]
+    raster_outputs: list[Output] = [output for name, output in RASTER_OUTPUTS.items() if name in wanted]
     if settings.deep:
-        drawn.append("contributors")
+        raster_outputs.append("contributors")
     deep = None
     with torch.no_grad():
-        output = rasterize(now.gaussians, now.camera, outputs=drawn)
-        before, after = (_moment(instant, path, step, settings.overscan) for step in (-1, 1))
+        output = rasterize(now.gaussians, now.camera, outputs=raster_outputs)
+        before, after = (_moment(triplet, path, step, settings.overscan) for step in (-1, 1))
         aovs = make_aovs(wanted, output, now, before, after, labels)
         if settings.deep:
             most = settings.deep_max_samples
             deep = sample_deep(output, now.gaussians, now.camera, max_samples=most)
         if settings.times != [0.0]:
-            moments = [_shifted(instant, path, time, settings.overscan) for time in settings.times]
+            moments = [_shifted(triplet, path, time, settings.overscan) for time in settings.times]
             output, coverage = _exposed(output, moments, labels if "crypto" in wanted else None)
             aovs = dataclasses.replace(aovs, coverage=coverage)
     return Picture(
-        frame=instant.frame,
+        frame=triplet.frame,
         camera=view,
         output=dataclasses.replace(output, contributors=None),
         aovs=aovs,
@@ -142,7 +142,7 @@ def take_picture(
     )
 
 
-def identify(
+def hash_job(
     frame: int, path: CameraPath, settings: RenderSettings, provenance: Mapping[str, str], writer: str
 ) -> str:
     """Return a hash of all that a picture's file depends on: equal where the bytes are equal.
@@ -177,17 +177,17 @@ def _widened(camera: Camera, overscan: int) -> Camera:
     return camera.cropped(-overscan, -overscan, *size) if overscan else camera
 
 
-def _moment(instant: Instant, path: CameraPath, step: int, overscan: int) -> Moment | None:
+def _moment(triplet: FrameTriplet, path: CameraPath, step: int, overscan: int) -> Moment | None:
     """Return the frame before or after, None where there is none."""
-    gaussians = instant.after if step > 0 else instant.before
+    gaussians = triplet.after if step > 0 else triplet.before
     if gaussians is None:
         return None
-    return Moment(gaussians, _widened(path.at(instant.frame + step), overscan))
+    return Moment(gaussians, _widened(path.at(triplet.frame + step), overscan))
 
 
-def _shifted(instant: Instant, path: CameraPath, time: float, overscan: int) -> Moment:
+def _shifted(triplet: FrameTriplet, path: CameraPath, time: float, overscan: int) -> Moment:
     """Return a time within the frame."""
-    return Moment(instant.at(time), _widened(path.at(instant.frame + time), overscan))
+    return Moment(triplet.at(time), _widened(path.at(triplet.frame + time), overscan))
 
 
 def _exposed(

@@ -13,13 +13,13 @@ import numpy as np
 from jaxtyping import UInt8
 
 from dsar.errors import ConfigError
-from dsar.geometry.paths import CameraPath
+from dsar.geometry.camera_paths import CameraPath
 from dsar.types import Camera, GaussianSequence, Picture
 from dsar_render.farm import run_tasks
-from dsar_render.images import delivered, display_image, over
-from dsar_render.instants import Instant, iterate_instants
-from dsar_render.labels import Labels, labels_of
-from dsar_render.picture import RenderSettings, identify, take_picture
+from dsar_render.images import crop_overscan, display_image, over
+from dsar_render.labels import Labels, label_sequence
+from dsar_render.picture import RenderSettings, hash_job, render_picture
+from dsar_render.triplets import FrameTriplet, iterate_triplets
 
 Image = UInt8[np.ndarray, "h w 3"]
 
@@ -76,7 +76,7 @@ class Shot:
     def jobs(self, frame: int, provenance: dict[str, str], writer: PictureWriter) -> list[str]:
         """Return the hash of each camera's file of a frame."""
         key = writer.key
-        return [identify(frame, path, self.settings, provenance, key) for path in self.paths]
+        return [hash_job(frame, path, self.settings, provenance, key) for path in self.paths]
 
     def complete(self, frame: int, provenance: dict[str, str]) -> bool:
         """Return whether all files of a frame are there, whole, and from this very shot."""
@@ -111,11 +111,11 @@ def render_shot(
             answer.
         RenderError: Workers died again and again.
     """
-    labels = labels_of(sequence) if "crypto" in shot.settings.aovs else None
+    labels = label_sequence(sequence) if "crypto" in shot.settings.aovs else None
     facts = labels, sequence.fps, dict(sequence.provenance)
     work = _Work(shot.writers, shot.settings, shot.previews, *facts)
-    instants = iterate_instants(sequence, frames, neighbours=shot.settings.needs_neighbours)
-    tasks = (_Task(instant, tuple(path.around(instant.frame) for path in shot.paths)) for instant in instants)
+    triplets = iterate_triplets(sequence, frames, neighbours=shot.settings.needs_neighbours)
+    tasks = (_Task(triplet, tuple(path.around(triplet.frame) for path in shot.paths)) for triplet in triplets)
     return run_tasks(work, tasks, jobs=jobs, scheduler=scheduler)
 
 
@@ -123,7 +123,7 @@ def render_shot(
 class _Task:
     """A frame to draw."""
 
-    instant: Instant
+    triplet: FrameTriplet
     paths: tuple[CameraPath, ...]
 
 
@@ -140,23 +140,23 @@ class _Work:
 
     def __call__(self, task: _Task) -> tuple[int, Image | None]:
         """Return the frame's number, and its preview."""
-        views = [view for paths in self._batches(task.paths) for view in self._shoot(task.instant, paths)]
-        return task.instant.frame, np.concatenate(views, 1) if views else None
+        views = [view for paths in self._batches(task.paths) for view in self._shoot(task.triplet, paths)]
+        return task.triplet.frame, np.concatenate(views, 1) if views else None
 
     def _batches(self, paths: tuple[CameraPath, ...]) -> list[tuple[CameraPath, ...]]:
         """Return which cameras' pictures are in memory at a time: one, unless they share a file."""
         return [paths] if any(writer.together for writer in self.writers) else [(path,) for path in paths]
 
-    def _shoot(self, instant: Instant, paths: tuple[CameraPath, ...]) -> list[Image]:
+    def _shoot(self, triplet: FrameTriplet, paths: tuple[CameraPath, ...]) -> list[Image]:
         """Write what some cameras see, and return their previews, if these are wanted."""
         labels, fps, provenance = self.labels, self.fps, self.provenance
         pictures = [
-            take_picture(instant, path, self.settings, labels=labels, fps=fps, provenance=provenance)
+            render_picture(triplet, path, self.settings, labels=labels, fps=fps, provenance=provenance)
             for path in paths
         ]
         shot = Shot(paths, self.writers, self.settings)
         for writer in self.writers:
-            writer.write(pictures, shot.jobs(instant.frame, provenance, writer))
+            writer.write(pictures, shot.jobs(triplet.frame, provenance, writer))
         if not self.previews:
             return []
-        return [display_image(over(delivered(each), 1.0)) for each in pictures]
+        return [display_image(over(crop_overscan(each), 1.0)) for each in pictures]

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from dsar.drafts import quoted_error, replacing
+from dsar.atomic_files import atomic_write, find_quoted_os_error
 from dsar.errors import ExportError, MissingDependencyError
-from dsar.geometry.rates import exact_rate
+from dsar.geometry.frame_rates import exact_rate
 
 
 def write_mp4(images: Iterable[UInt8[np.ndarray, "h w 3"]], path: Path, *, fps: float) -> Path:
@@ -36,7 +36,7 @@ def write_mp4(images: Iterable[UInt8[np.ndarray, "h w 3"]], path: Path, *, fps: 
     first = next(frames, None)
     if first is None:
         raise ExportError(f"{path.name}: expected at least one image, found none: widen the frame range")
-    with replacing(path) as draft:
+    with atomic_write(path) as draft:
         command = [ffmpeg, *_encoder_arguments(first, draft, fps)]
         with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as encoder:
             try:
@@ -52,7 +52,7 @@ def write_mp4(images: Iterable[UInt8[np.ndarray, "h w 3"]], path: Path, *, fps: 
             raise OSError(errno.EFBIG, os.strerror(errno.EFBIG))
         if encoder.returncode:
             failed = ExportError(f"{path}: ffmpeg stopped with code {encoder.returncode}: {log}")
-            raise quoted_error(log) or failed
+            raise find_quoted_os_error(log) or failed
     return path
 
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
-from dsar.geometry.paths import turntable
+from dsar.geometry.camera_paths import turntable
 from dsar.raster import rasterize
 from dsar_exporters import write_ply, write_usd
 

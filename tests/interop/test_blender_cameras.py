@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from dsar.geometry.camera_paths import turntable
 from dsar.geometry.cameras import project
-from dsar.geometry.paths import turntable
 from dsar.types import Camera
 from dsar_exporters import read_usd_cameras, write_usd
 

@@ -7,20 +7,20 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from dsar.geometry.paths import CameraPath
+from dsar.geometry.camera_paths import CameraPath
 from dsar_exporters import ExrSequence
-from dsar_render import RenderSettings, iterate_instants, labels_of, take_picture
+from dsar_render import RenderSettings, iterate_triplets, label_sequence, render_picture
 
 PROBE = Path(__file__).with_name("blender_cryptomatte_probe.py")
 
 
 @pytest.mark.parametrize("part", ["left_arm", "head"])
 def test_blender_takes_the_matte_of_a_part_out_of_our_file(blender, figure, front, tmp_path, part):
-    instant = next(iterate_instants(figure, [1002]))
+    triplet = next(iterate_triplets(figure, [1002]))
     layers = ("rgba", "Z", "N", "crypto")
-    labels = labels_of(figure)
+    labels = label_sequence(figure)
     settings = RenderSettings(aovs=layers)
-    picture = take_picture(instant, CameraPath((front,)), settings, labels=labels, fps=figure.fps)
+    picture = render_picture(triplet, CameraPath((front,)), settings, labels=labels, fps=figure.fps)
     (path,) = ExrSequence(tmp_path, layers=layers).write([picture], ["job"])
     found = tmp_path / "matte.exr"
     arguments = [blender, PROBE, path, found, part, front.width, front.height]

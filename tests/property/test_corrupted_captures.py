@@ -9,7 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from dsar.body.files import EMBEDDED_BODY
-from dsar.data.capture import open_capture
+from dsar.data.captures.formats import open_capture
 from dsar.errors import DsarError
 
 RANGES = {"train_frames": "0-1", "test_frames": "2-3"}
@@ -56,7 +56,7 @@ def read_all(root, name):
     for sequence, motion in capture.motions.items():
         assert np.isfinite(motion.rotations.numpy()).all()
         for frame in range(0, len(motion), 2):
-            for camera in capture.seen_by(sequence, frame)[:3]:
+            for camera in capture.cameras_with_image(sequence, frame)[:3]:
                 assert capture.image(sequence, frame, camera).shape[2] == 4
 
 

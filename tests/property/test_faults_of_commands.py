@@ -15,8 +15,8 @@ from skeletons import MIXAMO, write_layout
 import dsar
 from dsar.body.files import load_body
 from dsar.cli import main
-from dsar.data.capture import open_capture
-from dsar.data.motion import write_motion
+from dsar.data.captures.formats import open_capture
+from dsar.data.motions.files import write_motion
 from dsar.evaluation.stress import run_causal
 
 LOGGER = logging.getLogger(__name__)

@@ -11,7 +11,7 @@ from dsar.raster import rasterize
 from dsar.types import Camera, Gaussians
 
 FIELDS = tuple(field.name for field in dataclasses.fields(Gaussians))
-EXTRAS = ("median_depth", "front_depth", "heaviest", "contributors")
+EXTRAS = ("median_depth", "first_hit_depth", "largest_weight_id", "contributors")
 # Values that a diverged optimisation or a broken file brings, by field.
 SPOILS = {
     "means": (math.nan, math.inf, -1.0, 0.0),

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from dsar.body.files import load_body
 from dsar.body.model import JOINT_NAMES, PARENTS
 from dsar.body.skinning import forward_kinematics, pose_vertices
-from dsar.data.motion import turn_motion
+from dsar.data.motions.files import rotate_motion
 from dsar.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
 from dsar.types import Motion, Pose
 
@@ -70,7 +70,7 @@ def test_turning_a_motion_turns_its_vertices_about_the_world_origin(seed: int, a
     pose = random_pose(seed)
     turn = matrix_from_axis_angle(torch.tensor([0.0, angle, 0.0], dtype=torch.float64))
     motion = Motion(pose.rotations[None], pose.translation[None], 30.0)
-    turned = turn_motion(motion, BODY, turn)
+    turned = rotate_motion(motion, BODY, turn)
     expected = pose_vertices(SMALL, pose) @ turn.T
     assert torch.allclose(pose_vertices(SMALL, turned[0]), expected, atol=1e-9)
 

@@ -11,9 +11,9 @@ import torch
 from pxr import Gf, Usd, UsdGeom, UsdSkel, UsdVol, Vt
 
 from dsar.errors import ExportError
+from dsar.geometry.camera_paths import turntable
 from dsar.geometry.cameras import project
 from dsar.geometry.harmonics import C0
-from dsar.geometry.paths import turntable
 from dsar.geometry.rotations import matrix_from_axis_angle
 from dsar.raster import rasterize
 from dsar.types import Camera, Gaussians

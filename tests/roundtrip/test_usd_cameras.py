@@ -9,8 +9,8 @@ import torch
 from pxr import Gf, Sdf, Usd, UsdGeom
 
 from dsar.errors import ExportError
+from dsar.geometry.camera_paths import CameraPath, turntable
 from dsar.geometry.cameras import project
-from dsar.geometry.paths import CameraPath, turntable
 from dsar.types import Camera
 from dsar_exporters import list_usd_cameras, read_usd_cameras, write_usd
 

@@ -18,8 +18,8 @@ from dsar.body.files import load_body
 from dsar.cli import main
 from dsar.cli.train import Train
 from dsar.config import PRESETS
-from dsar.data.capture import open_capture
-from dsar.data.motion import write_motion
+from dsar.data.captures.formats import open_capture
+from dsar.data.motions.files import write_motion
 from dsar.evaluation.report import write_report
 from dsar.evaluation.stress import run_causal, run_stop
 from dsar.training.checkpoint import Run
@@ -235,7 +235,7 @@ def test_settings_that_cannot_work_are_refused_before_any_work(tiny_capture, tmp
     assert "cameras is 7" in failure(capsys, *start, "--cameras", "7")
     assert "pixel_shuffle is 0" in failure(capsys, *start, "--model.pixel-shuffle", "0")
     assert "--model.readout mean" in failure(capsys, *start, "--model.no-causal")
-    assert "GiB" in failure(capsys, *start, "--schedule.streams", "1000000")
+    assert "GiB" in failure(capsys, *start, "--schedule.rollouts-per-worker", "1000000")
     assert not (tmp_path / "run").exists()
 
 

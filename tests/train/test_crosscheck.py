@@ -55,7 +55,7 @@ def test_a_capture_alone_is_checked_by_the_scalar_variant(tiny_capture, tmp_path
 
 
 def test_a_file_that_says_something_else_is_named_and_fails(tiny_capture, tmp_path, capsys, monkeypatch):
-    written = dsar_exporters.written_projections
+    written = dsar_exporters.read_back_projections
 
     def wrong(cameras):
         found = written(cameras)
@@ -64,7 +64,7 @@ def test_a_file_that_says_something_else_is_named_and_fails(tiny_capture, tmp_pa
         found["usd"]["cam2"] = shift @ found["usd"]["cam2"]
         return found
 
-    monkeypatch.setattr(dsar_exporters, "written_projections", wrong)
+    monkeypatch.setattr(dsar_exporters, "read_back_projections", wrong)
     with pytest.raises(SystemExit) as ended:
         check(tmp_path, "--capture", str(tiny_capture), "--variant", "scalar_rgb")
     assert ended.value.code == 1

@@ -16,9 +16,9 @@ from dsar.config import config_from_json
 from dsar.errors import CheckpointError, ConfigError
 from dsar.evaluation.report import write_report
 from dsar.training.checkpoint import Run, load_checkpoint, newest_run
+from dsar.training.chunk import UpdateMetrics
 from dsar.training.report import Monitor
 from dsar.training.scene import open_scene
-from dsar.training.segment import Progress
 from tests.conftest import train_arguments
 
 AVATAR = "checkpoint/avatar.safetensors"
@@ -192,7 +192,7 @@ def test_a_training_curve_that_was_cut_is_shown_without_its_half_line_and_goes_o
     write_report(Run(run))
     assert "lines that are not whole, left out: 1 of 6" in caplog.text
     monitor = Monitor(curve, 200, None)
-    monitor.update(Progress(1.0, 0.5, None))
+    monitor.update(UpdateMetrics(1.0, 0.5, None))
     monitor.write(140, 0.7, "autoregressive", 1.0)
     caplog.clear()
     write_report(Run(run))

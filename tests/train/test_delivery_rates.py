@@ -15,11 +15,11 @@ from dsar.body.atlas import Atlas, body_chart
 from dsar.body.files import load_body
 from dsar.body.skinning import forward_kinematics, skin_points
 from dsar.config import ModelConfig
-from dsar.data.motion import resample
+from dsar.data.motions.files import resample
 from dsar.errors import MotionError
-from dsar.geometry.rates import exact_rate
+from dsar.geometry.frame_rates import exact_rate
 from dsar.types import Gaussians, Motion
-from dsar_render.instants import Instant
+from dsar_render.triplets import FrameTriplet
 
 RATES = [24.0, 24000 / 1001, 25.0, 30.0, 48.0, 60.0]
 FRAMES = 22
@@ -34,7 +34,7 @@ def skinned() -> Avatar:
     config = ModelConfig(channels=(8, 16), heads=2, window=3, memory=2, sh_degree=1)
     made = Avatar(load_body(), Atlas.stack([body_chart(load_body(), 32)]), config, 30.0)
     torch.nn.init.normal_(made.template.harmonics, std=0.2)
-    made.measure_maps([made.track(spin())])
+    made.fit_input_statistics([made.driving_signal(spin())])
     return made.eval()
 
 
@@ -103,7 +103,7 @@ def test_a_skinned_body_is_where_its_motion_has_it_at_that_time(skinned, fps):
         assert (gaussians.means - expected).norm(dim=1).max() < 2e-5
     # What a line between posed frames would make of it.
     (_, first), (_, second) = itertools.islice(roll_out(skinned, motion), 2)
-    chord = Instant(1001, first, after=second).at(0.5).means
+    chord = FrameTriplet(1001, first, after=second).at(0.5).means
     assert (chord - skin(skinned, spin(60.0))[1]).norm(dim=1).max() > 0.01
 
 

@@ -16,8 +16,8 @@ from PIL import Image
 
 from dsar.body.files import EMBEDDED_BODY, load_body
 from dsar.cli import main
-from dsar.data.capture import open_capture
-from dsar.data.motion import write_motion
+from dsar.data.captures.formats import open_capture
+from dsar.data.motions.files import write_motion
 from dsar.types import Motion
 from tests.conftest import train_arguments
 

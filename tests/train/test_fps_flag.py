@@ -17,10 +17,10 @@ from plyfile import PlyData
 from pxr import Usd, UsdGeom
 
 from dsar.cli import main
-from dsar.data.capture import open_capture
+from dsar.data.captures.formats import open_capture
 from dsar.geometry.camera_files import write_cameras_json
+from dsar.geometry.camera_paths import CameraPath
 from dsar.geometry.cameras import project
-from dsar.geometry.paths import CameraPath
 
 RATES = [("24", 8, 24.0), ("23.976", 8, 24000 / 1001), ("60000/1001", 18, 60000 / 1001)]
 """Rate as given, frames of 10 at 30 a second, rate that is meant."""

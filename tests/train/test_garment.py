@@ -6,15 +6,15 @@ import torch
 from scipy.ndimage import minimum_filter
 
 from dsar.avatar.avatar import Avatar
-from dsar.avatar.garment import loose_extent
+from dsar.avatar.garment_chart import loose_extent
 from dsar.config import AtlasConfig, TrainConfig
-from dsar.data.capture import open_capture
-from dsar.evaluation.garment import measure_garment
+from dsar.data.captures.formats import open_capture
+from dsar.evaluation.garment_metrics import measure_garment
 from dsar.raster import rasterize
+from dsar.training.chunk import ChunkTrainer
 from dsar.training.optimizers import make_optimizers, set_rates
-from dsar.training.rest import RestShapes
-from dsar.training.segment import SegmentTrainer
-from dsar.training.stages import Position
+from dsar.training.rest import RestOffsets
+from dsar.training.schedule import ScheduleState
 from dsar.training.workers import Gradients
 
 
@@ -33,7 +33,7 @@ def avatar(capture):
 def test_the_chart_spans_the_true_skirt_at_rest(capture, avatar):
     columns = AtlasConfig().resolution
     chart = avatar.template.means.detach()[-columns * AtlasConfig().garment_rows :]
-    pelvis = avatar.track(capture.motions["sway"])[0, 0, 0]
+    pelvis = avatar.driving_signal(capture.motions["sway"])[0, 0, 0]
     world = (chart @ pelvis[:3, :3].T + pelvis[:3, 3]).numpy()
     truth = capture.garment("sway")[0]
     assert abs(world[:, 1].min() - truth[:, 1].min()) < 0.04
@@ -56,9 +56,9 @@ def test_the_garments_figures_stand_between_the_template_s_and_the_truth_s(captu
 
 def test_links_close_the_tube_and_join_neither_charts_nor_islands(avatar):
     columns, rows = avatar.grid_size[1], AtlasConfig().garment_rows // avatar.model.upsample
-    row, column = avatar.cells // columns, avatar.cells % columns
+    row, column = avatar.control_cells // columns, avatar.control_cells % columns
     garment = row >= avatar.grid_size[0] - rows
-    a, b = avatar.links.T
+    a, b = avatar.surface_edges.T
     assert torch.equal(garment[a], garment[b])
     seam = garment[a] & ((column[a] - column[b]).abs() == columns - 1)
     assert seam.sum() == rows
@@ -84,7 +84,7 @@ def test_the_body_beneath_is_hidden_at_first_then_looks_like_bare_skin(capture):
     with torch.no_grad():
         template.harmonics.copy_(torch.rand(avatar.num_gaussians, 1, 3))
     before = template.harmonics.detach().clone()
-    avatar.reveal()
+    avatar.unhide_covered_texels()
     assert torch.equal(template.harmonics[~hidden], before[~hidden])
     shown = template.harmonics[hidden][:, 0].detach()
     bare = before[body & ~hidden][:, 0]
@@ -92,7 +92,7 @@ def test_the_body_beneath_is_hidden_at_first_then_looks_like_bare_skin(capture):
     assert torch.equal(template.opacity_logits[hidden], template.opacity_logits[~hidden][: hidden.sum()])
     with torch.no_grad():
         template.harmonics.zero_()
-    avatar.reveal()
+    avatar.unhide_covered_texels()
     assert not template.harmonics.any(), "what has been learnt since was thrown away"
 
 
@@ -100,14 +100,14 @@ def test_the_network_trains_with_the_whole_body_the_template_without_what_is_ben
     torch.manual_seed(0)
     config = TrainConfig()
     avatar = Avatar.from_capture(capture, capture.body, config.atlas, config.model).train()
-    trainer = SegmentTrainer(config, capture, avatar, {"sway": range(3)}, None)
+    trainer = ChunkTrainer(config, capture, avatar, {"sway": range(3)}, None)
     hidden = avatar.texel_hidden.clone()
     Gradients(list(avatar.parameters())).clear()
-    trainer.template_segment(np.random.default_rng(0), RestShapes(avatar, [("sway", 0)]), 2)
+    trainer.backward_template(np.random.default_rng(0), RestOffsets(avatar, [("sway", 0)]), 2)
     for name, parameter in avatar.template.named_parameters():
         assert parameter.grad[~hidden].any(), name
         assert not parameter.grad[hidden].any(), name
-    trainer.segment(np.random.default_rng(0), Position("autoregressive", 9, 2, 0.0, 0.0, 0.0))
+    trainer.backward_chunk(np.random.default_rng(0), ScheduleState("autoregressive", 9, 2, 0.0, 0.0, 0.0))
     assert not avatar.texel_hidden.any()
     assert avatar.template.opacity_logits[hidden].min() > 0
 
@@ -131,20 +131,20 @@ def test_one_fitted_frame_covers_the_mask(capture, sequence, frame):
     torch.manual_seed(0)
     config = TrainConfig()
     avatar = Avatar.from_capture(capture, capture.body, config.atlas, config.model).train()
-    avatar.reveal()
-    trainer = SegmentTrainer(config, capture, avatar, {sequence: range(frame + 1)}, None)
-    rest = RestShapes(avatar, [(sequence, frame)])
+    avatar.unhide_covered_texels()
+    trainer = ChunkTrainer(config, capture, avatar, {sequence: range(frame + 1)}, None)
+    rest = RestOffsets(avatar, [(sequence, frame)])
     optimizers = make_optimizers(avatar, rest, config.schedule)
     gradients = Gradients([*avatar.parameters(), *rest.parameters()])
     for step in range(110):
         reduction, factor = (2, 1.0) if step < 50 else (1, 0.5)
-        set_rates(optimizers, Position("template", 1, reduction, 0.0, 0.0, factor))
+        set_rates(optimizers, ScheduleState("template", 1, reduction, 0.0, 0.0, factor))
         gradients.clear()
-        trainer.template_segment(np.random.default_rng(step), rest, reduction)
+        trainer.backward_template(np.random.default_rng(step), rest, reduction)
         optimizers["adam"].step()
     solid_recall, soft_recall = [], []
     with torch.no_grad():
-        gaussians = avatar.gaussians(trainer.tracks[sequence][[frame]], rest.output(avatar, 0))[0]
+        gaussians = avatar.gaussians(trainer.signals[sequence][[frame]], rest.output(avatar, 0))[0]
         for index, camera in enumerate(capture.cameras):
             truth = torch.tensor(capture.image(sequence, frame, index)[..., 3]) / 255
             alpha = rasterize(gaussians, camera).alpha

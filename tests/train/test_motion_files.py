@@ -6,7 +6,7 @@ import torch
 from skeletons import LAFAN1, XSENS, world_joints, write_layout
 
 from dsar.cli.export import Export
-from dsar.data.motion import write_motion
+from dsar.data.motions.files import write_motion
 from dsar.errors import ConfigError, MotionError
 
 

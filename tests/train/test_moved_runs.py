@@ -11,11 +11,11 @@ import pytest
 
 from dsar.body.files import load_body
 from dsar.cli import main
-from dsar.data.capture import open_capture
-from dsar.data.motion import write_motion
+from dsar.data.captures.formats import open_capture
+from dsar.data.motions.files import write_motion
 from dsar.evaluation.stress import run_causal
 from dsar.geometry.camera_files import write_cameras_json
-from dsar.geometry.paths import CameraPath
+from dsar.geometry.camera_paths import CameraPath
 from dsar.training.scene import read_scene, scene_of_capture
 from tests.conftest import train_arguments
 

@@ -10,14 +10,14 @@ import torch
 
 from dsar.avatar.avatar import Avatar
 from dsar.config import ModelConfig, TrainConfig
-from dsar.data.capture import open_capture
-from dsar.evaluation.garment import distance_to_mesh
+from dsar.data.captures.formats import open_capture
+from dsar.evaluation.garment_metrics import distance_to_mesh
 from dsar.training import loop
+from dsar.training.chunk import ChunkTrainer
 from dsar.training.optimizers import make_optimizers, set_rates
-from dsar.training.registration import Registration, share_out
-from dsar.training.rest import PULL, RestShapes
-from dsar.training.segment import SegmentTrainer
-from dsar.training.stages import position
+from dsar.training.registration import Registration, divide_sequences
+from dsar.training.rest import PULL, RestOffsets
+from dsar.training.schedule import schedule_at
 from dsar.training.workers import Gradients
 
 SEQUENCE = "spin_right"
@@ -31,28 +31,28 @@ def registered():
     torch.manual_seed(0)
     config, capture = TrainConfig(), open_capture()
     avatar = Avatar.from_capture(capture, capture.body, config.atlas, config.model)
-    trainer = SegmentTrainer(config, capture, avatar, loop.training_clips(capture), None)
-    rest = RestShapes(avatar, loop.still_frames(trainer, avatar.fps))
+    trainer = ChunkTrainer(config, capture, avatar, loop.training_clips(capture), None)
+    rest = RestOffsets(avatar, loop.still_frames(trainer, avatar.fps))
     optimizers, gradients = (
         make_optimizers(avatar, rest, config.schedule),
         Gradients([*avatar.parameters(), *rest.parameters()]),
     )
     for step in range(60):
-        set_rates(optimizers, position(config.schedule, 0.12 * step / 60))
+        set_rates(optimizers, schedule_at(config.schedule, 0.12 * step / 60))
         gradients.clear()
-        trainer.template_segment(np.random.default_rng([0, step]), rest, 1)
+        trainer.backward_template(np.random.default_rng([0, step]), rest, 1)
         optimizers["adam"].step()
-    avatar.reveal()
+    avatar.unhide_covered_texels()
     clips = {SEQUENCE: range(4, LAST + 1)}
-    registration = Registration(config, capture, avatar, rest, trainer.tracks, clips)
-    forgotten = RestShapes(avatar, rest.frames)
-    copy = Registration(config, capture, avatar, forgotten, trainer.tracks, clips)
+    registration = Registration(config, capture, avatar, rest, trainer.signals, clips)
+    forgotten = RestOffsets(avatar, rest.frames)
+    copy = Registration(config, capture, avatar, forgotten, trainer.signals, clips)
     for _ in range(LAST - 5):
-        registration.advance()
-    copy.carry_on({name: tensor.clone() for name, tensor in registration.carried().items()})
+        registration.fit_next()
+    copy.load_state_dict({name: tensor.clone() for name, tensor in registration.state_dict().items()})
     for one in (registration, copy):
         while not one.complete:
-            one.advance()
+            one.fit_next()
     return capture, avatar, registration, copy
 
 
@@ -64,8 +64,8 @@ def test_the_template_finds_the_cloth_and_every_still_frame_has_folds_of_its_own
 
     def posed(index, output) -> tuple[torch.Tensor, torch.Tensor]:
         sequence, frame = rest.frames[index]
-        context, cloth = registration.tracks[sequence][[frame]], capture.garment(sequence)[frame]
-        return avatar.gaussians(context, output)[0].means[garment], torch.from_numpy(cloth)
+        motion_window, cloth = registration.signals[sequence][[frame]], capture.garment(sequence)[frame]
+        return avatar.gaussians(motion_window, output)[0].means[garment], torch.from_numpy(cloth)
 
     distances, own, shared = [], [], []
     with torch.no_grad():
@@ -88,7 +88,7 @@ def test_the_template_finds_the_cloth_and_every_still_frame_has_folds_of_its_own
 
 def test_what_keeps_a_garment_in_one_piece(registered):
     _, avatar, _, _ = registered
-    rest = RestShapes(avatar, [("sway", 2), ("sway", 0), ("walk", 0)])
+    rest = RestOffsets(avatar, [("sway", 2), ("sway", 0), ("walk", 0)])
     config, garment = dataclasses.replace(TrainConfig().loss, spatial=0.0), avatar.garment_texels()
     means, fitted = avatar.template.means.data, avatar.template.means.detach().clone()
     with torch.no_grad():
@@ -103,13 +103,13 @@ def test_what_keeps_a_garment_in_one_piece(registered):
             assert float(rest.loss(avatar, config)) > 1.001 * PULL
         finally:
             means.copy_(fitted)
-    assert torch.equal(rest.first("sway"), torch.full_like(rest.offsets[1], 0.01))
-    assert not rest.first("jumps").any()
+    assert torch.equal(rest.earliest("sway"), torch.full_like(rest.offsets[1], 0.01))
+    assert not rest.earliest("jumps").any()
 
 
 def distance_to_cloth(capture, avatar, registration, maps) -> float:
-    context = avatar.track(capture.motions[SEQUENCE])[[LAST]]
-    points = registration._posed(context, maps)
+    motion_window = avatar.driving_signal(capture.motions[SEQUENCE])[[LAST]]
+    points = registration._posed(motion_window, maps)
     cloth = torch.from_numpy(np.asarray(capture.garment(SEQUENCE)[LAST])).float()
     return float(torch.cdist(points, cloth).amin(1).mean())
 
@@ -118,13 +118,13 @@ def test_registered_maps_follow_the_cloth_into_a_spin(registered):
     capture, avatar, registration, _ = registered
     frames, maps = registration.result[SEQUENCE]
     assert set(frames) == set(range(4, LAST + 1))
-    found = maps[LAST, avatar.garment_points()]
+    found = maps[LAST, avatar.garment_control_points()]
     assert found.norm(dim=1).mean() > 0.01
     before = distance_to_cloth(capture, avatar, registration, torch.zeros_like(found))
     assert distance_to_cloth(capture, avatar, registration, found) < 0.6 * before
     # The body is left alone.
-    body = torch.ones(len(avatar.cells), dtype=torch.bool)
-    body[avatar.garment_points()] = False
+    body = torch.ones(len(avatar.control_cells), dtype=torch.bool)
+    body[avatar.garment_control_points()] = False
     assert (maps[:, body] == 0).all()
 
 
@@ -132,7 +132,7 @@ def test_cloth_that_no_camera_saw_stays_as_it_was_and_teaches_nothing(registered
     _, _, registration, _ = registered
     before = registration.offsets[SEQUENCE].clone()
     fitted = registration.fitted[SEQUENCE].clone()
-    monkeypatch.setattr(registration, "capture", SimpleNamespace(seen_by=lambda name, frame: []))
+    monkeypatch.setattr(registration, "capture", SimpleNamespace(cameras_with_image=lambda name, frame: []))
     monkeypatch.setattr(registration, "unseen", {SEQUENCE: frozenset({LAST})})
     try:
         assert registration.fit(SEQUENCE, LAST) is None
@@ -159,14 +159,14 @@ def test_the_network_learns_to_follow_maps_that_lag_behind_the_motion(registered
     model = ModelConfig(channels=(8, 16, 16), window=3, memory=2, heads=2)
     config = dataclasses.replace(config, model=model)
     small = Avatar.from_capture(capture, capture.body, config.atlas, model)
-    trainer = SegmentTrainer(config, capture, small, {SEQUENCE: range(4, LAST + 1)}, None)
+    trainer = ChunkTrainer(config, capture, small, {SEQUENCE: range(4, LAST + 1)}, None)
     trainer.registered = registration.result
-    optimizers = make_optimizers(small, RestShapes(small, []), config.schedule)
+    optimizers = make_optimizers(small, RestOffsets(small, []), config.schedule)
     gradients, losses = Gradients(list(small.parameters())), []
     for step in range(60):
-        set_rates(optimizers, position(config.schedule, 0.13 + 0.15 * step / 60))
+        set_rates(optimizers, schedule_at(config.schedule, 0.13 + 0.15 * step / 60))
         gradients.clear()
-        losses.append(trainer.imitation_segment(np.random.default_rng([1, step])).loss)
+        losses.append(trainer.backward_pretraining(np.random.default_rng([1, step])).loss)
         for optimizer in optimizers.values():
             optimizer.step()
     assert np.mean(losses[-10:]) < 0.5 * np.mean(losses[:10])
@@ -174,10 +174,10 @@ def test_the_network_learns_to_follow_maps_that_lag_behind_the_motion(registered
 
 def test_work_is_shared_out_evenly():
     clips = {"a": range(100), "b": range(60), "c": range(50), "d": range(5, 15)}
-    shares = share_out(clips, 2)
+    shares = divide_sequences(clips, 2)
     assert sorted(name for share in shares for name in share) == sorted(clips)
     assert sorted(sum(len(clips[name]) for name in share) for share in shares) == [110, 110]
-    assert share_out({}, 2) == [[], []]
+    assert divide_sequences({}, 2) == [[], []]
 
 
 def test_a_figure_without_a_garment_is_not_registered():
@@ -185,9 +185,9 @@ def test_a_figure_without_a_garment_is_not_registered():
     config, capture = TrainConfig(), open_capture()
     bare = dataclasses.replace(config.atlas, garment="off")
     avatar = Avatar.from_capture(capture, capture.body, bare, config.model)
-    registration = Registration(config, capture, avatar, RestShapes(avatar, []), {}, {SEQUENCE: range(9)})
+    registration = Registration(config, capture, avatar, RestOffsets(avatar, []), {}, {SEQUENCE: range(9)})
     assert registration.complete
-    assert registration.reduced(config.schedule).imitation_share == 0
+    assert registration.reduced(config.schedule).pretraining_fraction == 0
 
 
 class ThreeFrames(Registration):
@@ -196,13 +196,13 @@ class ThreeFrames(Registration):
     complete = property(lambda self: self.count == 3)
 
     def __init__(self):
-        self.used, self.count = 0.125, 0
-        self.avatar = SimpleNamespace(reveal=lambda: None)
+        self.budget_used, self.count = 0.125, 0
+        self.avatar = SimpleNamespace(unhide_covered_texels=lambda: None)
 
-    def advance(self):
+    def fit_next(self):
         self.count += 1
 
-    def share(self):
+    def all_gather(self):
         pass
 
 
@@ -221,4 +221,4 @@ def test_workers_whose_clocks_differ_agree_on_the_time_that_registration_took(be
 
     took = loop._register(registration, Shared([]), [], Late(1.0), 0.5, lambda *_: None)
     assert took == (False, 0.875)
-    assert registration.used == 0.125 + 0.375
+    assert registration.budget_used == 0.125 + 0.375

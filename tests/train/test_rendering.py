@@ -17,9 +17,9 @@ import OpenImageIO as oiio
 import pytest
 
 from dsar.cli import main
-from dsar.data.capture import open_capture
+from dsar.data.captures.formats import open_capture
 from dsar.geometry.camera_files import write_cameras_json
-from dsar.geometry.paths import CameraPath
+from dsar.geometry.camera_paths import CameraPath
 
 SHOT = (
     *("--frames", "1001-1010", "--camera", "cam0,turntable", "--res", "192", "256"),

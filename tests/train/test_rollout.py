@@ -10,7 +10,7 @@ from dsar.avatar.rollout import network_outputs, roll_out
 from dsar.body.atlas import Atlas, body_chart
 from dsar.body.files import load_body
 from dsar.config import ModelConfig
-from dsar.data.motion import turn_motion
+from dsar.data.motions.files import rotate_motion
 from dsar.errors import MotionError
 from dsar.geometry.rotations import matrix_from_axis_angle, matrix_from_quaternion
 from dsar.types import Motion
@@ -27,7 +27,7 @@ def avatar(request):
     made = Avatar(body, Atlas.stack([body_chart(body, 32)]), config, 30.0)
     torch.nn.init.normal_(made.network.decoder.head.weight, std=0.2)
     torch.nn.init.normal_(made.template.harmonics, std=0.2)
-    made.measure_maps([made.track(dance(60))])
+    made.fit_input_statistics([made.driving_signal(dance(60))])
     return made.eval()
 
 
@@ -55,7 +55,7 @@ def test_the_future_never_changes_the_past(avatar):
 def test_turning_and_shifting_the_motion_turns_and_shifts_the_gaussians(avatar):
     motion, turn = dance(10), matrix_from_axis_angle(torch.tensor([0.0, 1.3, 0.0]))
     shift = torch.tensor([2.0, 0.0, -1.0])
-    turned = turn_motion(motion, avatar.body, turn)
+    turned = rotate_motion(motion, avatar.body, turn)
     turned = dataclasses.replace(turned, translations=turned.translations + shift)
     for (_, one), (_, two) in zip(roll_out(avatar, motion), roll_out(avatar, turned), strict=True):
         assert torch.allclose(two.means, one.means @ turn.T + shift, atol=2e-4)
@@ -69,22 +69,28 @@ def test_turning_and_shifting_the_motion_turns_and_shifts_the_gaussians(avatar):
 def test_unfamiliar_poses_become_familiar_ones_once_trained():
     config = ModelConfig(channels=(8, 16), heads=2, pose_components=10)
     avatar = Avatar(load_body(), Atlas.stack([body_chart(load_body(), 32)]), config, 30.0)
-    avatar.measure_maps([avatar.track(dance(60))])
+    avatar.fit_input_statistics([avatar.driving_signal(dance(60))])
     flailing = dataclasses.replace(dance(60), rotations=3 * dance(60).rotations)
 
-    def standardized(motion: Motion) -> torch.Tensor:
-        return avatar.standardized(avatar.maps(avatar.track(motion)[:2], 30.0))[0]
+    def standardize(motion: Motion) -> torch.Tensor:
+        return avatar.standardize(avatar.input_maps(avatar.driving_signal(motion)[:2], 30.0))[0]
 
-    raw, wild = standardized(dance(60)), standardized(flailing)
+    raw, wild = standardize(dance(60)), standardize(flailing)
     avatar.eval()
-    near, tame = standardized(dance(60)), standardized(flailing)
+    near, tame = standardize(dance(60)), standardize(flailing)
     # Motion of many joints needs more than ten components, but not many more.
     assert (near - raw)[:, :3].square().mean() < 0.02 * raw[:, :3].square().mean()
     assert torch.equal(near[:, 3:], raw[:, 3:])
-    parts = avatar.maps(avatar.track(flailing)[:2], 30.0).maps[:, :3].flatten(2)[:, :, avatar.cells]
+    parts = (
+        avatar.input_maps(avatar.driving_signal(flailing)[:2], 30.0)
+        .maps[:, :3]
+        .flatten(2)[:, :, avatar.control_cells]
+    )
     far = ((parts.flatten(1) - avatar.pose_mean) @ avatar.pose_basis.mT).abs() / avatar.pose_deviation
     assert far.max() > 2
-    points = tame[:, :3].flatten(2)[:, :, avatar.cells] * avatar.map_scale[:3, 0] + avatar.map_mean[:3, 0]
+    points = (
+        tame[:, :3].flatten(2)[:, :, avatar.control_cells] * avatar.map_scale[:3, 0] + avatar.map_mean[:3, 0]
+    )
     found = ((points.flatten(1) - avatar.pose_mean) @ avatar.pose_basis.mT).abs() / avatar.pose_deviation
     assert found.max() < 2.01
     assert not torch.allclose(tame[:, :3], wild[:, :3], atol=0.1)
@@ -128,7 +134,11 @@ def test_a_teleport_cannot_explode_the_network(avatar):
 
 @pytest.mark.parametrize(
     ("setting", "off", "gone"),
-    [("velocity", False, range(3, 6)), ("acceleration", False, range(6, 9)), ("lags", (), range(9, 18))],
+    [
+        ("velocity", False, range(3, 6)),
+        ("acceleration", False, range(6, 9)),
+        ("mean_time_constants", (), range(9, 18)),
+    ],
 )
 def test_maps_that_are_switched_off_leave_the_others_and_the_speed_as_they_are(setting, off, gone):
     body, atlas = load_body(), Atlas.stack([body_chart(load_body(), 16)])
@@ -136,11 +146,11 @@ def test_maps_that_are_switched_off_leave_the_others_and_the_speed_as_they_are(s
     seen = []
     for model in (config, dataclasses.replace(config, **{setting: off})):
         avatar = Avatar(body, atlas, model, 30.0)
-        context = avatar.track(dance(20))[5:15]
-        seen.append(avatar.maps(context, 30.0))
+        motion_window = avatar.driving_signal(dance(20))[5:15]
+        seen.append(avatar.input_maps(motion_window, 30.0))
         assert seen[-1].maps.shape[1] == model.map_channels
     full, less = seen
     kept = [channel for channel in range(config.map_channels) if channel not in gone]
     assert all(full.maps[:, channel].abs().max() > 1e-4 for channel in range(config.map_channels))
     assert torch.equal(full.maps[:, kept], less.maps)
-    assert torch.equal(full.speed, less.speed)
+    assert torch.equal(full.magnitude, less.magnitude)

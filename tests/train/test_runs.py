@@ -42,7 +42,7 @@ def test_training_leaves_everything_the_contract_names_and_gets_better(trained):
 def test_an_interrupted_run_resumes_to_the_same_bits(tiny_capture, tmp_path):
     """Two workers; SIGINT once training moves, then the same command with --resume."""
     whole, stopped = tmp_path / "whole", tmp_path / "stopped"
-    command = ("--steps", "60", "--workers", "2", "--schedule.template-share", "0.1")
+    command = ("--steps", "60", "--workers", "2", "--schedule.template-fraction", "0.1")
     finished(started(train_arguments(tiny_capture, whole, *command)))
     process = started(train_arguments(tiny_capture, stopped, *command))
     deadline = time.monotonic() + 120
@@ -65,7 +65,7 @@ def test_a_value_that_is_not_finite_stops_the_run_and_is_named(tiny_capture, tmp
         main(
             train_arguments(
                 tiny_capture, tmp_path / "run", "--steps", "40", "--workers", "1",
-                "--schedule.learning-rate", "1e38", "--schedule.clip", "1e38",
+                "--schedule.learning-rate", "1e38", "--schedule.max-gradient-norm", "1e38",
             )
         )  # fmt: skip
     assert stop.value.code == 2

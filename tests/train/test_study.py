@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from dsar.drafts import write_whole
+from dsar.atomic_files import write_text_atomically
 from dsar.errors import ConfigError
 from dsar.evaluation.report import write_report
 from dsar.evaluation.stress import run_causal
@@ -79,11 +79,11 @@ def test_a_study_goes_on_with_what_is_missing_and_does_nothing_twice(tiny_captur
     summary = summarize_tables(study, TINY)
     run = Run(tmp_path / "full,seed=0")
     found = {"complete": False, "minutes": 0.05, "capture": str(tiny_capture), "tables": summary}
-    write_whole(run.study, json.dumps(found))
+    write_text_atomically(run.study, json.dumps(found))
     page = write_report(run).read_text()
     for text in ("Beside other models", "not complete yet", "no feedback"):
         assert text in page
-    write_whole(run.study, json.dumps(found | {"capture": "embedded"}))
+    write_text_atomically(run.study, json.dumps(found | {"capture": "embedded"}))
     assert "No study beside this run" in write_report(run).read_text()
     full, less, zeroed = summary["tiny"]["rows"]
     assert full["seeds"] == zeroed["seeds"] == [0]

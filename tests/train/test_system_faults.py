@@ -14,8 +14,8 @@ from pxr import Gf, Usd, UsdGeom
 
 from dsar.body.files import load_body
 from dsar.cli import main
-from dsar.data.capture import open_capture
-from dsar.data.motion import write_motion
+from dsar.data.captures.formats import open_capture
+from dsar.data.motions.files import write_motion
 from dsar.evaluation.stress import run_causal
 
 README = Path(__file__).parents[2] / "README.md"
@@ -155,7 +155,7 @@ def test_an_interrupt_says_what_is_kept(place, capsys, monkeypatch):
         ("dsar_render.render_shot", "render runs/anna --mp4 a.mp4", "nothing was written"),
         ("dsar.training.loop.train", "train my_capture --resume --out runs/anna", "saved up to update 120"),
         ("dsar.training.loop.train", "train my_capture --out runs/other", "no checkpoint was written yet"),
-        ("dsar.data.capture.open_capture", "check my_capture", "nothing was written"),
+        ("dsar.data.captures.formats.open_capture", "check my_capture", "nothing was written"),
     ):
         with contextlib.ExitStack() as stack:
             patch = stack.enter_context(pytest.MonkeyPatch.context())

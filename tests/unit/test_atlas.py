@@ -5,8 +5,8 @@ import dataclasses
 import pytest
 import torch
 
-from dsar.avatar.avatar import grid_cells
-from dsar.avatar.fused import bilinear_taps, sample
+from dsar.avatar.avatar import assign_control_cells
+from dsar.avatar.fused_posing import bilinear_sampling, sample_bilinear
 from dsar.body.atlas import Atlas, body_chart, rasterize_uv, smooth_weights
 from dsar.body.files import load_body
 from dsar.errors import BodyError
@@ -55,7 +55,7 @@ def test_uv_outside_the_square_is_refused(body):
 
 def test_every_occupied_cell_holds_a_texel_of_its_own(body):
     atlas = Atlas.stack([body_chart(body, 64)])
-    cells, nearest = grid_cells(atlas, 4)
+    cells, nearest = assign_control_cells(atlas, 4)
     texel = atlas.texels[nearest]
     assert torch.equal(texel // 64 // 4 * 16 + texel % 64 // 4, cells)
     assert len(cells.unique()) == len(cells)
@@ -68,7 +68,7 @@ def test_taps_sample_maps_as_bilinear_interpolation_does():
         grid.flatten() for grid in torch.meshgrid(torch.arange(24), torch.arange(16), indexing="ij")
     )
     expected = torch.nn.functional.interpolate(maps, size=(24, 16), mode="bilinear")
-    sampled = sample(maps, bilinear_taps(rows, columns, 4, (6, 4), square=24))
+    sampled = sample_bilinear(maps, bilinear_sampling(rows, columns, 4, (6, 4), square=24))
     assert torch.allclose(sampled.mT.reshape(2, 3, 24, 16), expected, atol=1e-6)
 
 
@@ -77,7 +77,9 @@ def test_a_garments_taps_go_round_its_tube_and_stay_off_the_body():
     rows, columns = (
         grid.flatten() for grid in torch.meshgrid(torch.arange(24), torch.arange(16), indexing="ij")
     )
-    sampled = sample(maps, bilinear_taps(rows, columns, 4, (6, 4), square=16)).mT.reshape(2, 3, 24, 16)
+    sampled = sample_bilinear(maps, bilinear_sampling(rows, columns, 4, (6, 4), square=16)).mT.reshape(
+        2, 3, 24, 16
+    )
     body, tube = (
         torch.nn.functional.interpolate(part, scale_factor=4, mode="bilinear")
         for part in (maps[:, :, :4], maps[:, :, 4:].repeat(1, 1, 1, 3))

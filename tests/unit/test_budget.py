@@ -12,7 +12,7 @@ from dsar.training import budget
 
 SMALL = TrainConfig(
     model=ModelConfig(channels=(8, 16), window=3, memory=2, heads=2),
-    schedule=ScheduleConfig(streams=3, segment=2),
+    schedule=ScheduleConfig(rollouts_per_worker=3, chunk_frames=2),
 )
 
 
@@ -21,7 +21,7 @@ def test_activations_are_those_that_a_real_step_keeps(wiring):
     config = dataclasses.replace(SMALL, model=dataclasses.replace(SMALL.model, wiring=wiring))
     size = budget.map_size(config)
     network = DualStreamNetwork(config.model, torch.ones(size, dtype=torch.bool))
-    state = network.start(3)
+    state = network.initial_state(3)
     state = dataclasses.replace(state, fresh=torch.zeros(3, dtype=torch.bool))
     maps, magnitude = torch.randn(3, config.model.map_channels, *size), torch.rand(3, 1, *size)
     saved = {}
@@ -48,7 +48,9 @@ def test_activations_are_those_that_a_real_step_keeps(wiring):
 
 def test_the_papers_preset_is_refused_where_it_does_not_fit(monkeypatch):
     monkeypatch.setattr(budget, "available_memory", lambda: 24 * 2**30)
-    with pytest.raises(ConfigError, match=r"about \d+\.\d GiB, 24\.0 GiB are free; .*--schedule.segment"):
+    with pytest.raises(
+        ConfigError, match=r"about \d+\.\d GiB, 24\.0 GiB are free; .*--schedule.chunk-frames"
+    ):
         budget.check_budget(PRESETS["paper"], 2)
     monkeypatch.setattr(budget, "available_memory", lambda: 2**40)
     monkeypatch.setattr(budget, "measure_flops", lambda: 1e11)
@@ -61,7 +63,7 @@ def test_the_papers_preset_is_refused_where_it_does_not_fit(monkeypatch):
 def test_the_papers_network_has_the_papers_size():
     """Its n encodings make 1 TFLOP a frame; three times that with gradients (reference arithmetic)."""
     config = PRESETS["paper"]
-    one = dataclasses.replace(config, schedule=dataclasses.replace(config.schedule, segment=1))
+    one = dataclasses.replace(config, schedule=dataclasses.replace(config.schedule, chunk_frames=1))
     assert 3.0e12 < budget.estimate(one).flop < 5.0e12
     assert 10e6 < budget.estimate(one).parameters < 15e6
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from dsar.body.files import load_body
 from dsar.body.model import JOINT_NAMES
 from dsar.body.skinning import forward_kinematics
-from dsar.data.motion import read_motion
+from dsar.data.motions.files import read_motion
 from dsar.errors import MotionError
 
 # CMU's hierarchy: joint, parent, rest offset in its unit. Legs are splayed, arms level.

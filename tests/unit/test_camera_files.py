@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from dsar.data.capture import EMBEDDED_CAPTURE, open_capture
+from dsar.data.captures.formats import EMBEDDED_CAPTURE, open_capture
 from dsar.errors import ConfigError
 from dsar.geometry.camera_files import list_cameras_json, read_cameras_json, write_cameras_json
+from dsar.geometry.camera_paths import CameraPath
 from dsar.geometry.cameras import look_at
-from dsar.geometry.paths import CameraPath
 from dsar.types import Camera
 
 

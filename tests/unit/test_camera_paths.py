@@ -10,8 +10,8 @@ import torch
 
 from dsar.body.files import load_body
 from dsar.body.skinning import forward_kinematics, skin_points
+from dsar.geometry.camera_paths import DOLLY, ORBIT, TURNTABLE, CameraPath, dolly, orbit, turntable
 from dsar.geometry.cameras import look_at, project
-from dsar.geometry.paths import DOLLY, ORBIT, TURNTABLE, CameraPath, dolly, orbit, turntable
 from dsar.geometry.rotations import axis_angle_from_matrix
 from dsar.types import Binding, Camera
 

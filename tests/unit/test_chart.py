@@ -6,11 +6,11 @@ import pytest
 
 from dsar.evaluation.study.chart import (
     Point,
+    chart_points,
     draw_chart,
     interactive_chart,
     pareto_front,
-    points_of,
-    times_of,
+    training_time_series,
 )
 
 POINTS = [
@@ -49,10 +49,10 @@ def test_zeroed_and_missing_rows_are_no_models():
         "time": {"split": "fd", "rows": [longer]},
         "other": other,
     }
-    assert points_of(summary) == [Point("full", 20.0, 21.0, None, 100.0, 1.0)]
+    assert chart_points(summary) == [Point("full", 20.0, 21.0, None, 100.0, 1.0)]
     row["spread"]["psnr_box"] = 0.4
-    assert points_of(summary)[0].spread == {"psnr_box": 0.2}
-    assert times_of(summary) == {"full": [(5.0, 21.0), (20.0, 22.0)]}
+    assert chart_points(summary)[0].spread == {"psnr_box": 0.2}
+    assert training_time_series(summary) == {"full": [(5.0, 21.0), (20.0, 22.0)]}
 
 
 def test_the_interactive_chart_names_who_was_measured():

@@ -13,11 +13,11 @@ from PIL import Image
 from dsar.body.files import load_body
 from dsar.body.skinning import pose_vertices
 from dsar.cli import main
-from dsar.data.capture import open_capture
-from dsar.data.motion import write_motion
+from dsar.data.captures.formats import open_capture
+from dsar.data.motions.files import write_motion
 from dsar.errors import CaptureError
 from dsar.evaluation.check import check_capture, draw_overlays
-from dsar.evaluation.check.agreement import silhouette
+from dsar.evaluation.check.silhouettes import silhouette
 from dsar.geometry.cameras import look_at
 from dsar.types import Camera, Motion
 
@@ -153,10 +153,10 @@ def edit_motion(**changes):
 def write_y_up(folder):
     """Motion whose file has Y up, where AMASS has Z up."""
     body, made = load_body(), motions()
-    from dsar.data.motion import turn_motion
+    from dsar.data.motions.files import rotate_motion
 
     for name, motion in made.items():
-        write_motion(folder / f"{name}.npz", turn_motion(motion, body, layouts.z_up().T), body)
+        write_motion(folder / f"{name}.npz", rotate_motion(motion, body, layouts.z_up().T), body)
 
 
 def delay(folder):
@@ -318,9 +318,9 @@ def test_the_body_is_drawn_over_the_images(clean):
     rows, columns = draw_overlays(capture)
     assert list(rows) == [camera.name for camera in capture.cameras]
     assert all(len(images) == len(columns) for images in rows.values())
-    picture = rows["cam0"][0]
-    assert picture.shape == (HEIGHT, WIDTH, 3)
-    orange = (picture[..., 0] > picture[..., 2].astype(int) + 40).mean()
+    summary = rows["cam0"][0]
+    assert summary.shape == (HEIGHT, WIDTH, 3)
+    orange = (summary[..., 0] > summary[..., 2].astype(int) + 40).mean()
     assert 0.03 < orange < 0.4
 
 

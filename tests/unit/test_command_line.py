@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 
 from dsar.cli import parse
-from dsar.cli.common import file_stem
+from dsar.cli.command import file_stem
 from dsar.cli.train import Train
 from dsar.config import PRESETS
+from dsar.training.chunk import UpdateMetrics
 from dsar.training.report import Monitor
-from dsar.training.segment import Progress
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -49,7 +49,7 @@ def test_the_time_left_is_judged_by_what_this_process_did(tmp_path):
     """A run that goes on at 90 % and does a hundredth in ten seconds has ninety more before it."""
     lines = []
     monitor = Monitor(tmp_path / "metrics.jsonl", 1000, lines.append, began=0.9)
-    monitor.update(Progress(1.0, 0.01))
+    monitor.update(UpdateMetrics(1.0, 0.01))
     monitor.write(900, 0.9, "autoregressive", 0.0)
     monitor.write(910, 0.91, "autoregressive", 10.0)
     assert lines[0].seconds_left is None

@@ -11,7 +11,7 @@ from dsar.raster import cuda, rasterize
 from dsar.raster.reference import _project, _radii, rasterize_reference
 from dsar.types import Camera, Gaussians
 
-EXTRAS = ("median_depth", "front_depth", "heaviest", "contributors")
+EXTRAS = ("median_depth", "first_hit_depth", "largest_weight_id", "contributors")
 
 
 class StandIn:
@@ -93,7 +93,7 @@ def test_adapter_returns_what_the_reference_does(monkeypatch, scene, antialiased
     monkeypatch.setattr(cuda, "_load_gsplat", lambda: gsplat)
     ours = cuda.rasterize_cuda(gaussians, camera, background, 0.3, antialiased, EXTRAS)
     true = rasterize_reference(gaussians, camera, background, 0.3, antialiased, EXTRAS)
-    for name in ("color", "alpha", "depth", "median_depth", "front_depth", "heaviest"):
+    for name in ("color", "alpha", "depth", "median_depth", "first_hit_depth", "largest_weight_id"):
         assert torch.allclose(getattr(ours, name), getattr(true, name), atol=1e-5), name
     assert torch.equal(ours.contributors.counts, true.contributors.counts)
     assert torch.equal(ours.contributors.ids, true.contributors.ids)

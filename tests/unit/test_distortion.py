@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from dsar.data.distortion import check_distortion, undistort
+from dsar.data.images.distortion import parse_distortion, undistort
 from dsar.errors import CaptureError
 from dsar.types import Camera
 
@@ -60,10 +60,10 @@ def test_no_distortion_leaves_the_image_alone(camera):
     [((), (0,) * 5), ([[0.1, 0.2]], (0.1, 0.2, 0, 0, 0)), ([0.1] * 5 + [0.0] * 3, (0.1,) * 5)],
 )
 def test_coefficients_are_completed(numbers, expected):
-    assert check_distortion("cam", numbers) == expected
+    assert parse_distortion("cam", numbers) == expected
 
 
 @pytest.mark.parametrize("numbers", [[0.1] * 6, ["a"], [float("inf")], [None]])
 def test_other_models_are_refused(numbers):
     with pytest.raises(CaptureError, match=r"cam: .*distCoeff"):
-        check_distortion("cam", numbers)
+        parse_distortion("cam", numbers)

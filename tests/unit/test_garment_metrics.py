@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from dsar.data.capture import open_capture
-from dsar.evaluation.garment import (
+from dsar.data.captures.formats import open_capture
+from dsar.evaluation.garment_metrics import (
     closest_on_triangles,
     distance_to_mesh,
     garment_mask,

@@ -11,8 +11,8 @@ import torch
 
 from dsar.body.files import EMBEDDED_BODY, load_body
 from dsar.body.skinning import pose_vertices
-from dsar.data.capture import open_capture
-from dsar.data.scans import _load
+from dsar.data.captures.formats import open_capture
+from dsar.data.captures.scans import _load
 from dsar.errors import BodyError, CaptureError, DsarError, MotionError
 from dsar.geometry.cameras import project
 
@@ -150,11 +150,11 @@ def test_captures_are_opened_anew_in_other_processes(written, name):
 
 
 def test_without_ranges_two_thirds_train_and_a_gap_is_left(written, original, tmp_path):
-    from dsar.data.takes import GAP, cut_take
+    from dsar.data.captures.takes import GAP, split_take
 
-    assert cut_take(300, None, None) == (range(200), range(200 + GAP, 300))
-    assert cut_take(300, "0-99", None) == (range(100), range(200 + GAP, 300))
-    assert cut_take(300, "0-250", None) == (range(251), range(251 + GAP, 300))
+    assert split_take(300, None, None) == (range(200), range(200 + GAP, 300))
+    assert split_take(300, "0-99", None) == (range(100), range(200 + GAP, 300))
+    assert split_take(300, "0-250", None) == (range(251), range(251 + GAP, 300))
     with pytest.raises(CaptureError, match=r"no frames are left to test with.*gap of 40"):
         open_capture(written / "avatarrex", body=EMBEDDED_BODY)
 
@@ -170,7 +170,7 @@ def test_listed_and_absent_images_are_skipped_for_their_camera_only(folder, capl
     (root / layouts.SERIALS[2] / "mask/pha/00000003.jpg").unlink()
     capture = open_written(root.parent, "avatarrex")
     train = capture.splits["train"][0]
-    seen = [capture.seen_by(train, frame) for frame in range(5)]
+    seen = [capture.cameras_with_image(train, frame) for frame in range(5)]
     everyone = list(range(4))
     assert seen == [everyone, everyone, [0, 2, 3], [0, 1, 3], everyone]
     assert f"cam_{layouts.SERIALS[1]} 1, cam_{layouts.SERIALS[2]} 1 of 14" in caplog.text

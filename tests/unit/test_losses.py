@@ -68,12 +68,12 @@ def loss(records, ages, **weights):
 
 
 def test_spatial_loss_counts_a_centimetre_between_neighbours_as_one():
-    offsets, links = torch.full((2, 3, 3), 0.2), torch.tensor([[0, 1], [1, 2]])
-    assert spatial_loss(offsets, links) == 0
+    offsets, edges = torch.full((2, 3, 3), 0.2), torch.tensor([[0, 1], [1, 2]])
+    assert spatial_loss(offsets, edges) == 0
     offsets[0, 0, 1] += 0.01
     # One link of two, in one rollout of two.
-    assert abs(float(spatial_loss(offsets, links)) - 0.25) < 1e-5
-    assert spatial_loss(offsets, links[:0]) == 0
+    assert abs(float(spatial_loss(offsets, edges)) - 0.25) < 1e-5
+    assert spatial_loss(offsets, edges[:0]) == 0
 
 
 def test_prediction_loss_counts_a_centimetre_as_one():

@@ -27,7 +27,7 @@ def bare_avatar() -> Avatar:
 
 
 def mirror_of(avatar: Avatar) -> Mirror:
-    return Mirror(avatar.control_points, avatar.control_axes, avatar.cells)
+    return Mirror(avatar.control_points, avatar.control_axes, avatar.control_cells)
 
 
 def test_a_mirrored_motion_is_that_of_the_mirrored_joint_angles():
@@ -53,9 +53,9 @@ def test_mirrored_offsets_displace_the_mirrored_points():
     points = avatar.control_points
     # A displacement that is smooth in space: up on the left, backwards on the right, outwards at the head.
     world = torch.stack([points[:, 0] * points[:, 1], points[:, 0] * 0.3, -points[:, 0] * 0.2], -1)
-    offset[0, :, avatar.cells] = (avatar.control_axes.mT @ world[..., None])[..., 0].T
-    mirrored = mirror_of(avatar).offset(offset.reshape(1, 3, h, w)).flatten(2)
-    moved = (avatar.control_axes @ mirrored[0, :, avatar.cells].T[..., None])[..., 0]
+    offset[0, :, avatar.control_cells] = (avatar.control_axes.mT @ world[..., None])[..., 0].T
+    mirrored = mirror_of(avatar).mirror_offset(offset.reshape(1, 3, h, w)).flatten(2)
+    moved = (avatar.control_axes @ mirrored[0, :, avatar.control_cells].T[..., None])[..., 0]
     reflected = torch.stack([-points[:, 0] * points[:, 1], -points[:, 0] * 0.3, points[:, 0] * 0.2], -1)
     expected = reflected * FLIP
     near = torch.cdist(points * FLIP, points).amin(1) < 0.02
@@ -69,9 +69,9 @@ def test_only_the_rollouts_that_were_mirrored_are_turned_back():
     h, w = avatar.grid_size
     channels = avatar.model.appearance_channels
     output = NetworkOutput(torch.randn(2, 3, h, w), torch.randn(2, channels, h, w), ())
-    turned = mirror_of(avatar).undo(output, torch.tensor([False, True]))
+    turned = mirror_of(avatar).unmirror(output, torch.tensor([False, True]))
     assert torch.equal(turned.offset[0], output.offset[0])
     assert torch.equal(turned.appearance[0], output.appearance[0])
-    expected = mirror_of(avatar).offset(output.offset)
+    expected = mirror_of(avatar).mirror_offset(output.offset)
     assert torch.equal(turned.offset[1], expected[1])
     assert not torch.equal(turned.offset[1], output.offset[1])

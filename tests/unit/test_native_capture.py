@@ -13,8 +13,8 @@ from PIL import Image
 
 from dsar.body.files import load_body
 from dsar.body.skinning import forward_kinematics
-from dsar.data.capture import EMBEDDED_CAPTURE, open_capture
-from dsar.data.motion import write_motion
+from dsar.data.captures.formats import EMBEDDED_CAPTURE, open_capture
+from dsar.data.motions.files import write_motion
 from dsar.errors import CaptureError, ConfigError
 from dsar.geometry.cameras import look_at, project
 from dsar.types import Motion
@@ -159,7 +159,7 @@ def test_missing_frames_are_counted_and_skipped_for_their_camera_only(folder, ca
     (folder / "walk/cam1/0001.png").unlink()
     capture = open_capture(folder)
     assert "cam1 lacks 1 of 3 frames, the first is 1; it does without" in caplog.text
-    assert [capture.seen_by("walk", frame) for frame in range(3)] == [[0, 1], [0], [0, 1]]
+    assert [capture.cameras_with_image("walk", frame) for frame in range(3)] == [[0, 1], [0], [0, 1]]
 
 
 def test_a_camera_without_any_frame_is_refused(folder):

@@ -8,9 +8,9 @@ from literal_network import LiteralNetwork, LiteralRollout
 
 from dsar.config import ModelConfig
 from dsar.network import STREAMS, DualStreamNetwork, NetworkState
-from dsar.network.streaming import Rollout
+from dsar.network.session import InferenceSession
 
-SMALL = ModelConfig(window=4, memory=3, channels=(4, 8), heads=2, identity_channels=2)
+SMALL = ModelConfig(window=4, memory=3, channels=(4, 8), heads=2, uv_feature_channels=2)
 SIZE = (8, 12)
 
 
@@ -37,7 +37,7 @@ def inputs(config: ModelConfig, frames: int, batch: int = 2) -> tuple[torch.Tens
 
 
 def roll(network, maps, speed, state: NetworkState | None = None, **options):
-    state = state or network.start(maps.shape[1])
+    state = state or network.initial_state(maps.shape[1])
     outputs = []
     for frame in range(len(maps)):
         output, state = network(maps[frame], speed[frame], state, **options)
@@ -113,7 +113,7 @@ def test_each_stream_alone_carries_the_past_beyond_the_window(wiring, feedback, 
 def test_gradients_reach_both_streams_through_time(wiring):
     config = dataclasses.replace(SMALL, wiring=wiring)
     network, (maps, speed) = build(config), inputs(config, 3)
-    state = network.start(2).map(lambda t: t.clone())
+    state = network.initial_state(2).map(lambda t: t.clone())
     state = dataclasses.replace(
         state,
         fresh=torch.zeros_like(state.fresh),
@@ -145,7 +145,7 @@ VARIANTS = {
     "mean of rows": {"readout": "mean"},
     "bidirectional": {"readout": "mean", "causal": False},
     "no motion embedding": {"motion_embedding": False},
-    "no identities": {"identity_channels": 0},
+    "no identities": {"uv_feature_channels": 0},
     "pixel shuffle": {"pixel_shuffle": 2},
     "one frame": {"window": 1},
 }
@@ -153,14 +153,14 @@ VARIANTS = {
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_what_is_saved_changes_nothing(wiring, variant):
-    """A literal reading, training's steps and a rollout's agree, beyond the window and the bank."""
+    """A literal reading, training's steps and a session's agree, beyond the window and the bank."""
     config = dataclasses.replace(SMALL, wiring=wiring, **VARIANTS[variant])
     network = build(config).double()
     literal = LiteralNetwork(network)
     maps, speed = (x.double() for x in inputs(config, 9))
     with torch.no_grad():
         trained, _ = roll(network, maps, speed)
-        slow, fast = LiteralRollout(literal), Rollout(network)
+        slow, fast = LiteralRollout(literal), InferenceSession(network)
         for frame, expected in enumerate(trained):
             read = slow.step(maps[frame], speed[frame])
             kept = fast.step(maps[frame], speed[frame])
@@ -172,28 +172,35 @@ def test_what_is_saved_changes_nothing(wiring, variant):
 
 ABLATIONS = {
     # What changes, and whose parameters come, go or change their size with it.
-    "without GeoStream": ({"feedback": 0}, {"encoder.poses.first.weight"}),
-    "three offsets": ({"feedback": 3}, {"encoder.poses.first.weight"}),
+    "without GeoStream": ({"feedback": 0}, {"encoder.pyramid.first.weight"}),
+    "three offsets": ({"feedback": 3}, {"encoder.pyramid.first.weight"}),
     "without StateStream": ({"memory": 0}, {"bank."}),
-    "direct attention": ({"memory": 1, "bank": "features"}, {"bank.attention.age"}),
-    "without velocity": ({"velocity": False}, {"encoder.poses.first.weight"}),
-    "without acceleration": ({"acceleration": False}, {"encoder.poses.first.weight"}),
-    "without lags": ({"lags": ()}, {"encoder.poses.first.weight"}),
+    "direct attention": ({"memory": 1, "bank": "features"}, {"bank.attention.position_embedding"}),
+    "without velocity": ({"velocity": False}, {"encoder.pyramid.first.weight"}),
+    "without acceleration": ({"acceleration": False}, {"encoder.pyramid.first.weight"}),
+    "without lags": ({"mean_time_constants": ()}, {"encoder.pyramid.first.weight"}),
     "without motion embedding": ({"motion_embedding": False}, {"motion_embedding."}),
     "mean of rows": ({"readout": "mean"}, set()),
     "bidirectional": ({"readout": "mean", "causal": False}, set()),
     "linear bases": ({"bases": 4}, {"decoder."}),
-    "longer": ({"window": 6, "memory": 5}, {"attention.age", "bank.attention.age", "mixing.0.weights"}),
+    "longer": (
+        {"window": 6, "memory": 5},
+        {"attention.position_embedding", "bank.attention.position_embedding", "aggregation.0.weights"},
+    ),
 }
 
 
-FIRST = "encoder.poses.first.weight"
+FIRST = "encoder.pyramid.first.weight"
 
 
 def kept_maps(config):
     """Return which channels of SMALL's maps another configuration has: position, then what it switches."""
-    switched = {"velocity": config.velocity, "acceleration": config.acceleration, "lags": bool(config.lags)}
-    groups = {"velocity": range(3, 6), "acceleration": range(6, 9), "lags": range(9, 18)}
+    switched = {
+        "velocity": config.velocity,
+        "acceleration": config.acceleration,
+        "mean_time_constants": bool(config.mean_time_constants),
+    }
+    groups = {"velocity": range(3, 6), "acceleration": range(6, 9), "mean_time_constants": range(9, 18)}
     return [0, 1, 2, *(channel for name, group in groups.items() if switched[name] for channel in group)]
 
 
@@ -216,8 +223,8 @@ def test_an_ablation_changes_its_part_and_the_output(name):
         # The inputs that stay keep their weights, so what differs is due to those that went or came.
         first = weights[FIRST]
         offsets = first[:, SMALL.map_channels : SMALL.map_channels + 3]
-        parts = [first[:, kept], *[offsets] * config.feedback, first[:, -SMALL.identity_channels :]]
-        ablated.encoder.poses.first.weight.data = torch.cat(parts, 1)
+        parts = [first[:, kept], *[offsets] * config.feedback, first[:, -SMALL.uv_feature_channels :]]
+        ablated.encoder.pyramid.first.weight.data = torch.cat(parts, 1)
     one, _ = roll(full, maps, speed)
     two, _ = roll(ablated, maps[:, :, kept], speed)
     assert (one[-1].offset - two[-1].offset).abs().max() > 1e-6
@@ -234,9 +241,9 @@ def test_rollouts_of_the_smallest_networks_are_those_of_training(changes):
     config = dataclasses.replace(SMALL, **changes)
     network, (maps, speed) = build(config).double(), (x.double() for x in inputs(config, 8))
     expected, _ = roll(network, maps, speed)
-    rollout = Rollout(network)
+    session = InferenceSession(network)
     for frame, output in enumerate(expected):
-        made = rollout.step(maps[frame], speed[frame])
+        made = session.step(maps[frame], speed[frame])
         assert torch.allclose(made.offset, output.offset, atol=1e-12)
         assert torch.allclose(made.appearance, output.appearance, atol=1e-12)
     assert expected[-1].offset.abs().max() > 1e-3
@@ -253,9 +260,12 @@ def test_rows_that_see_the_future_differ_from_causal_ones():
 def test_a_stream_taken_away_in_a_rollout_is_one_that_training_leaves_out(wiring, stream):
     config = dataclasses.replace(SMALL, wiring=wiring)
     network, (maps, speed) = build(config).double(), (x.double() for x in inputs(config, 8))
-    both, rest = Rollout(network), Rollout(network, tuple(s for s in STREAMS if s != stream))
+    both, rest = (
+        InferenceSession(network),
+        InferenceSession(network, tuple(s for s in STREAMS if s != stream)),
+    )
     outputs = [
-        [rollout.step(m, v).offset for m, v in zip(maps, speed, strict=True)] for rollout in (both, rest)
+        [session.step(m, v).offset for m, v in zip(maps, speed, strict=True)] for session in (both, rest)
     ]
     without, _ = roll(network, maps, speed, streams=rest.streams)
     for alone, trained in zip(outputs[1], without, strict=True):
@@ -265,7 +275,7 @@ def test_a_stream_taken_away_in_a_rollout_is_one_that_training_leaves_out(wiring
 
 def test_sixteen_bits_are_enough_for_a_rollout():
     network, (maps, speed) = build(SMALL), inputs(SMALL, 40)
-    exact, short = Rollout(network), Rollout(network, precision=torch.bfloat16)
+    exact, short = InferenceSession(network), InferenceSession(network, precision=torch.bfloat16)
     error, size = 0.0, 0.0
     for m, v in zip(maps, speed, strict=True):
         one, other = exact.step(m, v).offset, short.step(m, v).offset
@@ -281,7 +291,7 @@ def test_a_recorded_rollout_is_the_one_of_the_cpu(wiring, variant):
     """One CUDA graph is replayed for all steps after the first, wherever in the rings the newest frame is."""
     config = dataclasses.replace(SMALL, wiring=wiring, **VARIANTS[variant])
     network, (maps, speed) = build(config), inputs(config, 20)
-    slow, recorded = Rollout(network), Rollout(network.cuda())
+    slow, recorded = InferenceSession(network), InferenceSession(network.cuda())
     for m, v in zip(maps, speed, strict=True):
         expected, found = slow.step(m, v).offset, recorded.step(m.cuda(), v.cuda()).offset
         assert torch.allclose(found.cpu(), expected, atol=1e-5)

@@ -10,7 +10,7 @@ from PIL import Image, TiffImagePlugin
 from profiles import P3, SRGB, ink_profile, rgb_profile
 
 from dsar.color import linear_from_srgb, srgb_from_linear
-from dsar.data.images import decode_mask, decode_photograph
+from dsar.data.images.decoding import decode_mask_levels, decode_photograph
 from dsar.errors import CaptureError
 from dsar.types import Camera
 
@@ -40,7 +40,7 @@ def photograph(path, camera=CAMERA):
 
 
 def levels(path):
-    found = decode_mask(path, CAMERA)
+    found = decode_mask_levels(path, CAMERA)
     return found.values, " / ".join(note.what for note in found.notes)
 
 
@@ -255,7 +255,7 @@ def test_a_jpeg_of_a_mask_rings_and_is_one_all_the_same(tmp_path):
     large = np.kron(MASK, np.ones((8, 8), np.uint8))
     camera = Camera(torch.eye(3), torch.eye(4), 8 * W, 8 * H, "cam")
     path = save(tmp_path / "a.jpg", np.dstack([large] * 3), quality=60)
-    assert np.array_equal(decode_mask(path, camera).values > 127, large > 127)
+    assert np.array_equal(decode_mask_levels(path, camera).values > 127, large > 127)
 
 
 @pytest.mark.parametrize(

@@ -262,7 +262,7 @@ def test_distant_splats_keep_their_light_when_antialiased(backend):
     assert draw(gaussian, camera, backend, dilation=0.5).alpha.sum() > 5 * light
 
 
-EXTRAS = ("median_depth", "front_depth", "heaviest", "contributors")
+EXTRAS = ("median_depth", "first_hit_depth", "largest_weight_id", "contributors")
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -291,8 +291,8 @@ def test_extra_outputs_equal_the_reference(scene, backend):
     )
     # A fragment right at a cut-off may fall on either side of it.
     assert (fast.contributors.counts != slow.contributors.counts).float().mean() < 0.01
-    assert (fast.heaviest != slow.heaviest).float().mean() < 0.01
-    assert (~((fast.front_depth - slow.front_depth).abs() <= 1e-4)).float().mean() < 0.01
+    assert (fast.largest_weight_id != slow.largest_weight_id).float().mean() < 0.01
+    assert (~((fast.first_hit_depth - slow.first_hit_depth).abs() <= 1e-4)).float().mean() < 0.01
     assert (~((fast.median_depth - slow.median_depth).abs() <= 1e-4)).float().mean() < 0.01
     same = (fast.contributors.counts == slow.contributors.counts).all(1)
     rows = [
@@ -314,7 +314,7 @@ def test_the_first_and_the_heaviest_gaussian_are_those_of_the_list(backend, scen
     for pixel, (shares, mine) in enumerate(
         zip(weights.split(counts.flatten().tolist()), ids.split(counts.flatten().tolist()), strict=True)
     ):
-        heaviest, front = output.heaviest.flatten()[pixel], output.front_depth.flatten()[pixel]
+        heaviest, front = output.largest_weight_id.flatten()[pixel], output.first_hit_depth.flatten()[pixel]
         assert heaviest == (mine[shares.argmax()] if len(mine) else -1)
         assert front == pytest.approx(float(gaussians.means[mine[0], 2]) if len(mine) else 0.0, abs=1e-5)
 
@@ -420,7 +420,7 @@ gaussians = Gaussians(
     torch.rand(50), torch.rand(50, 16, 3),
 ).map(torch.Tensor.requires_grad_)
 camera = Camera(torch.tensor([[40.0, 0, 20], [0, 40, 15], [0, 0, 1]]), torch.eye(4), 40, 30, "front")
-for extras in ((), ("median_depth", "heaviest", "contributors")):
+for extras in ((), ("median_depth", "largest_weight_id", "contributors")):
     rasterize(gaussians, camera, antialiased=True, outputs=extras).color.sum().backward()
 assert len(kernels) >= 6 and min(loaded) == 1, loaded
 assert [len(kernel.signatures) for kernel in kernels] == loaded
@@ -434,7 +434,7 @@ def test_kernels_are_compiled_anew_when_what_they_share_changes():
 
 
 def test_a_list_of_tiles_that_would_not_fit_is_refused(monkeypatch):
-    monkeypatch.setattr(cpu, "_MOST_PAIRS", 11)
+    monkeypatch.setattr(cpu, "_MAX_PAIRS", 11)
     wall = one_gaussian(scales=torch.full((1, 3), 50.0))
     with pytest.raises(RasterError, match="1 Gaussians cover 12 tiles"):
         rasterize(wall, make_camera())
@@ -468,7 +468,8 @@ def test_inputs_that_do_not_fit_are_refused():
     with pytest.raises(ConfigError, match="no camera gradients"):
         rasterize(gaussians, dataclasses.replace(camera, K=camera.K.clone().requires_grad_()))
     with pytest.raises(
-        ConfigError, match="outputs can be median_depth, front_depth, heaviest, contributors; found normals"
+        ConfigError,
+        match="outputs can be median_depth, first_hit_depth, largest_weight_id, contributors; found normals",
     ):
         _check_outputs(["normals"])
     with pytest.raises(ConfigError, match="float32 tensors on a GPU, not"):

@@ -10,7 +10,7 @@ from PIL import Image
 
 from dsar.errors import ExportError
 from dsar.types import RenderOutput
-from dsar_render import display_image, write_mp4, write_png, write_sheet
+from dsar_render import display_image, write_contact_sheet, write_mp4, write_png
 
 
 @pytest.fixture
@@ -104,7 +104,7 @@ def test_sheet_shows_every_image_untouched_and_in_its_row(tmp_path):
         "cam00 truth": [np.full((20, 90, 3), (level, 0, 0), np.uint8) for level in (50, 60)],
         "cam00 prediction": [np.full((20, 90, 3), (level, 0, 0), np.uint8) for level in (70, 80)],
     }
-    path = write_sheet(tmp_path / "sheet.png", rows, columns=["frame 1", "frame 2"])
+    path = write_contact_sheet(tmp_path / "sheet.png", rows, columns=["frame 1", "frame 2"])
     pixels = np.asarray(Image.open(path))
     where = {}
     for level in (50, 60, 70, 80):
@@ -118,4 +118,6 @@ def test_sheet_shows_every_image_untouched_and_in_its_row(tmp_path):
 
 def test_a_row_with_a_missing_image_is_refused(tmp_path):
     with pytest.raises(ExportError, match=r"row truth: expected 2 images, found 1"):
-        write_sheet(tmp_path / "s.png", {"truth": [np.zeros((4, 4, 3), np.uint8)]}, columns=["a", "b"])
+        write_contact_sheet(
+            tmp_path / "s.png", {"truth": [np.zeros((4, 4, 3), np.uint8)]}, columns=["a", "b"]
+        )

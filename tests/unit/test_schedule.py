@@ -1,4 +1,4 @@
-"""Stages of training and the rollouts' places."""
+"""Stages of training and the rollouts' cursors."""
 
 import numpy as np
 import pytest
@@ -7,32 +7,32 @@ import torch
 from dsar.config import PRESETS, ScheduleConfig, TrainConfig, config_from_json, config_to_json
 from dsar.errors import ConfigError
 from dsar.training.optimizers import set_rates
-from dsar.training.stages import WHOLE_CLIP, position
-from dsar.training.streams import Streams
+from dsar.training.rollouts import RolloutBatch
+from dsar.training.schedule import WHOLE_CLIP, schedule_at
 
 
-def test_stages_follow_each_other_and_the_horizon_only_grows():
-    schedule = ScheduleConfig(pose_share=0.15, horizon=16)
-    walk = [position(schedule, i / 1000) for i in range(1000)]
+def test_stages_follow_each_other_and_rollouts_only_grow_longer():
+    schedule = ScheduleConfig(pose_only_fraction=0.15, max_rollout_frames=16)
+    walk = [schedule_at(schedule, i / 1000) for i in range(1000)]
     stages = [p.stage for p in walk]
-    assert stages == sorted(stages, key=["template", "imitation", "pose", "autoregressive"].index)
+    assert stages == sorted(stages, key=["template", "pretraining", "pose", "autoregressive"].index)
     assert len(set(stages)) == 4
-    horizons = [p.horizon for p in walk if p.stage == "autoregressive"]
-    assert horizons == sorted(horizons)
-    assert horizons[0] == schedule.horizon
-    assert horizons[-1] == WHOLE_CLIP
-    assert sum(h == WHOLE_CLIP for h in horizons) >= 0.45 * len(horizons)
+    lengths = [p.max_rollout_frames for p in walk if p.stage == "autoregressive"]
+    assert lengths == sorted(lengths)
+    assert lengths[0] == schedule.max_rollout_frames
+    assert lengths[-1] == WHOLE_CLIP
+    assert sum(h == WHOLE_CLIP for h in lengths) >= 0.45 * len(lengths)
     assert walk[-1].network_rate < 0.03 * schedule.learning_rate
 
 
 def test_only_a_new_template_travels_far_and_has_shapes_of_its_own_in_still_frames():
-    schedule = ScheduleConfig(pose_share=0.15, horizon=16)
+    schedule = ScheduleConfig(pose_only_fraction=0.15, max_rollout_frames=16)
 
     def rates(progress: float) -> tuple[str, dict[str, float]]:
         names = ("means", "quaternions", "log_scales", "opacity_logits", "harmonics", "network", "rest")
         groups = [{"params": [torch.nn.Parameter(torch.zeros(1))], "name": name} for name in names]
         adam = torch.optim.Adam(groups, lr=1.0)
-        now = position(schedule, progress)
+        now = schedule_at(schedule, progress)
         set_rates({"adam": adam}, now)
         return now.stage, {group["name"]: group["lr"] for group in adam.param_groups}
 
@@ -50,26 +50,26 @@ def test_only_a_new_template_travels_far_and_has_shapes_of_its_own_in_still_fram
     assert shares == [{2.0}, {0.2}]
 
 
-def test_rollouts_restart_at_the_horizon_and_at_the_end_of_a_clip():
-    streams = Streams({"a": range(0, 10), "b": range(5, 8)}, 3)
+def test_rollouts_restart_after_the_most_frames_and_at_the_end_of_a_clip():
+    rollouts = RolloutBatch({"a": range(0, 10), "b": range(5, 8)}, 3)
     rng = np.random.default_rng(0)
     for _ in range(200):
-        places, fresh = streams.next_frames(rng, 4)
-        for place, restarted in zip(places, fresh, strict=True):
-            assert place.frame in streams.clips[place.sequence]
-            assert place.age < 4
-            assert restarted == (place.age == 0)
-        streams.advance()
+        cursors, fresh = rollouts.next_frames(rng, 4)
+        for cursor, restarted in zip(cursors, fresh, strict=True):
+            assert cursor.frame in rollouts.clips[cursor.sequence]
+            assert cursor.age < 4
+            assert restarted == (cursor.age == 0)
+        rollouts.advance()
 
 
 def test_a_whole_clip_starts_at_its_first_frame_and_is_seen_to_its_end():
-    streams = Streams({"a": range(3, 10)}, 1)
+    rollouts = RolloutBatch({"a": range(3, 10)}, 1)
     rng = np.random.default_rng(0)
     seen = []
     for _ in range(14):
-        (place,), _ = streams.next_frames(rng, WHOLE_CLIP)
-        seen.append(place.frame)
-        streams.advance()
+        (cursor,), _ = rollouts.next_frames(rng, WHOLE_CLIP)
+        seen.append(cursor.frame)
+        rollouts.advance()
     # Only the very first start is anywhere, so that several rollouts are out of step.
     first = seen[0]
     assert seen == ([*range(first, 10)] + [*range(3, 10)] * 2)[:14]

@@ -2,8 +2,8 @@
 
 import torch
 
-from dsar.evaluation.horizon import looped
-from dsar.evaluation.settling import rms_speeds, settle_time
+from dsar.evaluation.looping import loop_motion
+from dsar.evaluation.settling import rms_speeds, settling_time
 from dsar.geometry.rotations import matrix_from_axis_angle
 from dsar.types import Motion
 
@@ -15,10 +15,10 @@ def test_a_damped_swing_settles_when_its_envelope_is_low():
     points[:, :, 1] = x[:, None]
     speeds = rms_speeds(points, 100.0)
     # Speed is at most 4 pi exp(-2 t), reached twice a swing: below a fifth of that from ln(5) / 2 = .80 s on.
-    settled = settle_time(speeds, 0, 299, 0.2 * 4 * torch.pi, 100.0)
+    settled = settling_time(speeds, 0, 299, 0.2 * 4 * torch.pi, 100.0)
     assert 0.80 - 0.25 < settled <= 0.81
-    assert settle_time(speeds, 0, 50, 0.2 * 4 * torch.pi, 100.0) == 0.5, "not settled within the stretch"
-    assert settle_time(torch.zeros(20), 0, 20, 0.1, 100.0) == 0
+    assert settling_time(speeds, 0, 50, 0.2 * 4 * torch.pi, 100.0) == 0.5, "not settled within the stretch"
+    assert settling_time(torch.zeros(20), 0, 20, 0.1, 100.0) == 0
 
 
 def test_speed_is_in_metres_a_second():
@@ -31,7 +31,7 @@ def test_rounds_are_equal_and_joined_without_a_jump():
     generator = torch.Generator().manual_seed(0)
     rotations = (0.1 * torch.randn(20, 55, 3, generator=generator)).cumsum(0) * 0.3
     motion = Motion(rotations, rotations[:, 0].clone(), 30.0, "walk")
-    long, period = looped(motion, 3, bridge=0.5)
+    long, period = loop_motion(motion, 3, bridge=0.5)
     assert len(long) == 3 * period
     assert torch.equal(long.rotations[:20], motion.rotations)
     assert torch.equal(long.rotations[:period], long.rotations[period : 2 * period])

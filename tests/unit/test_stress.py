@@ -11,7 +11,7 @@ from dsar.body.atlas import Atlas, body_chart
 from dsar.body.files import load_body
 from dsar.config import ModelConfig
 from dsar.evaluation import stress as battery
-from dsar.evaluation.drills import spin_and_stop, swaying
+from dsar.evaluation.stress_motions import spin_and_stop, sway_motion
 from dsar.network import NetworkOutput
 from dsar.types import Motion
 
@@ -95,8 +95,8 @@ def test_a_rollout_that_sees_the_future_is_caught(avatar, motion, monkeypatch):
     honest = battery.network_outputs
 
     def peeking(avatar, motion):
-        for context, output in honest(avatar, motion):
-            yield context, dataclasses.replace(output, offset=output.offset + motion.rotations.mean())
+        for motion_window, output in honest(avatar, motion):
+            yield motion_window, dataclasses.replace(output, offset=output.offset + motion.rotations.mean())
 
     monkeypatch.setattr(battery, "network_outputs", peeking)
     assert not battery.run_causal(avatar, motion).passed
@@ -110,8 +110,8 @@ def test_twins_meet_where_the_state_is_forgotten_and_only_there(avatar, motion):
     class Elephant(Avatar):
         """Never forgets: adds its previous offset to the next."""
 
-        def advance(self, context, state, **streams):
-            output, after, maps = super().advance(context, state, **streams)
+        def forward_frame(self, motion_window, state, **streams):
+            output, after, maps = super().forward_frame(motion_window, state, **streams)
             offset = output.offset + state.offsets[:, -1]
             after = dataclasses.replace(after, offsets=torch.cat([after.offsets[:, 1:], offset[:, None]], 1))
             return dataclasses.replace(output, offset=offset), after, maps
@@ -137,7 +137,7 @@ def test_other_rates_of_the_same_motion_are_compared_at_the_avatar_s(avatar, mot
 
 
 def test_a_sway_is_periodic_and_begins_at_rest(motion):
-    sway, period = swaying(motion, 4)
+    sway, period = sway_motion(motion, 4)
     assert period == 60
     torch.testing.assert_close(sway.rotations[0], motion.rotations[0])
     torch.testing.assert_close(sway.rotations[60:120], sway.rotations[120:180], atol=1e-5, rtol=0)

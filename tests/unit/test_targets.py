@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from dsar.data.capture import open_capture
+from dsar.data.captures.formats import open_capture
 from dsar.training.targets import MARGIN, load_target, mask_box
 
 

@@ -3,8 +3,8 @@
 import numpy as np
 import torch
 
-from dsar.avatar.garment import tube_tangents
-from dsar.avatar.template import SCALE_RANGE, SPREAD, THICKNESS, footprint
+from dsar.avatar.garment_chart import tube_tangents
+from dsar.avatar.template import SCALE_IN_TEXELS, SCALE_RANGE, THICKNESS, texel_footprints
 from dsar.body.atlas import body_chart
 from dsar.body.files import load_body
 from dsar.geometry.rotations import matrix_from_axis_angle, matrix_from_quaternion
@@ -13,10 +13,10 @@ from dsar.geometry.rotations import matrix_from_axis_angle, matrix_from_quaterni
 def test_footprint_has_the_texels_own_covariance():
     torch.manual_seed(0)
     tangents = torch.randn(200, 3, 2) * 0.01
-    rotations, scales = footprint(tangents)
+    rotations, scales = texel_footprints(tangents)
     axes = matrix_from_quaternion(rotations)
     flat = axes[..., :2] * scales[:, None, :2]
-    expected = SPREAD**2 * tangents @ tangents.mT
+    expected = SCALE_IN_TEXELS**2 * tangents @ tangents.mT
     assert torch.allclose(flat @ flat.mT, expected, atol=1e-9)
     # The thin axis is the texel's normal.
     assert (axes[..., 2:].mT @ tangents).abs().max() < 1e-7
@@ -25,11 +25,11 @@ def test_footprint_has_the_texels_own_covariance():
 
 def test_footprint_turns_with_the_texel_and_follows_its_sides():
     tangents = torch.tensor([[[0.01, 0.0], [0.0, 0.03], [0.0, 0.0]], [[0.03, 0.0], [0.0, 0.01], [0.0, 0.0]]])
-    rotations, scales = footprint(tangents)
+    rotations, scales = texel_footprints(tangents)
     assert torch.allclose(matrix_from_quaternion(rotations), torch.eye(3).expand(2, 3, 3), atol=1e-6)
     assert torch.allclose(scales[0, :2], scales[1, :2].flip(0))
     turn = matrix_from_axis_angle(torch.tensor([0.4, -0.2, 1.0]))
-    turned, same = footprint(turn @ tangents)
+    turned, same = texel_footprints(turn @ tangents)
     assert torch.allclose(matrix_from_quaternion(turned), turn.expand(2, 3, 3), atol=1e-5)
     assert torch.allclose(same, scales)
 

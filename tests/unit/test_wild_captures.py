@@ -14,12 +14,12 @@ from PIL import Image, ImageOps
 
 from dsar.body.files import EMBEDDED_BODY
 from dsar.cli import main
-from dsar.data.capture import open_capture
+from dsar.data.captures.formats import open_capture
 from dsar.errors import BodyError, CaptureError
-from dsar.evaluation.check import content
-from dsar.evaluation.check.glance import refuse_at_a_glance
-from dsar.evaluation.check.photographs import find_misfits
-from dsar.evaluation.check.pictures import judge_colors, judge_masks
+from dsar.evaluation.check import image_summaries
+from dsar.evaluation.check.image_findings import find_color_faults, find_mask_faults
+from dsar.evaluation.check.mask_alignment import find_misaligned_masks
+from dsar.evaluation.check.quick_check import refuse_unusable_images
 
 RANGES = {"train_frames": "0-7", "test_frames": "9-13"}
 NAMES = ("avatarrex", "thuman4", "actorshq", "dress", "native")
@@ -48,19 +48,19 @@ def reopened(written, root, name):
     return open_capture(root, body=body, **({} if name in ("dress", "native") else RANGES))
 
 
-def pictures(capture):
+def summaries(capture):
     return [
         capture.image(sequence, frame, index)
         for sequence, motion in capture.motions.items()
         for frame in range(0, len(motion), 4)
-        for index in capture.seen_by(sequence, frame)
+        for index in capture.cameras_with_image(sequence, frame)
     ]
 
 
 def assert_same(one, other, tolerance=0):
     assert [camera.name for camera in one.cameras] == [camera.name for camera in other.cameras]
     assert list(one.motions) == list(other.motions)
-    pairs = list(zip(pictures(one), pictures(other), strict=True))
+    pairs = list(zip(summaries(one), summaries(other), strict=True))
     assert len(pairs) >= 16
     for a, b in pairs:
         assert np.abs(a.astype(int) - b).max() <= tolerance
@@ -120,7 +120,7 @@ def test_folders_and_cameras_may_have_spaces_and_other_letters(folder, written):
     capture = reopened(written, root, "avatarrex")
     assert [camera.name for camera in capture.cameras] == ["Kamera_1", "links_oben", "u53f3", "Gru00f6u00dfe"]
     for one, other in zip(
-        pictures(capture), pictures(reopened(written, written / "avatarrex", "avatarrex")), strict=True
+        summaries(capture), summaries(reopened(written, written / "avatarrex", "avatarrex")), strict=True
     ):
         assert np.array_equal(one, other)
 
@@ -276,10 +276,13 @@ def test_check_and_train_give_the_same_reason_for_the_same_file(folder, tmp_path
 
 def judged(capture):
     """Return the names and words of what is wrong with masks and photographs."""
-    found = list(content.read_pictures(capture))
-    assert not [picture.broken for picture in found if picture.broken]
+    found = list(image_summaries.summarize_images(capture))
+    assert not [summary.broken for summary in found if summary.broken]
     usable = {(p.sequence, p.frame, p.camera) for p in found if p.coverage > 0 and not p.full}
-    return {each.name: each for each in (*judge_masks(capture, found), *judge_colors(capture, found, usable))}
+    return {
+        each.name: each
+        for each in (*find_mask_faults(capture, found), *find_color_faults(capture, found, usable))
+    }
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -304,7 +307,7 @@ def test_photographs_that_are_turned_against_their_masks_are_named_with_their_ca
     assert found["photographs_turned"].fatal
     assert f"photographs of cam_{layouts.SERIALS[2]} are {how} against" in found["photographs_turned"].what
     usable = {(name, frame, 2) for name, motion in capture.motions.items() for frame in range(len(motion))}
-    (misfit,) = find_misfits(capture, usable)
+    (misfit,) = find_misaligned_masks(capture, usable)
     assert misfit.after > misfit.before + 0.1
 
 
@@ -406,4 +409,4 @@ def test_what_check_says_cannot_train_is_refused_before_training_in_its_words(fo
 
 @pytest.mark.parametrize("name", NAMES)
 def test_clean_captures_pass_at_a_glance(written, name):
-    refuse_at_a_glance(reopened(written, written / name, name))
+    refuse_unusable_images(reopened(written, written / name, name))

@@ -17,7 +17,7 @@ import numpy as np
 from numpy import ndarray
 
 from capture.posing import Curve, Score, compose_motion
-from dsar.data.motion import read_motion
+from dsar.data.motions.files import read_motion
 from dsar.types import Body, Motion
 
 FPS = 30.0

@@ -16,7 +16,7 @@ from PIL import Image
 
 from capture.choreography import OneToMany, Take
 from capture.garment import COLUMNS, ROWS, grid_faces
-from dsar.data.motion import write_motion
+from dsar.data.motions.files import write_motion
 from dsar.types import Body, Camera
 
 QUALITY = 77

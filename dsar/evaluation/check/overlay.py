@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
-from dsar.data.multiview import MultiViewCapture
+from dsar.data.captures.multiview import MultiViewCapture
 from dsar.errors import CaptureError
-from dsar.evaluation.check.agreement import choose_frames, read, silhouette
+from dsar.evaluation.check.silhouettes import choose_frames, read, silhouette
 
 HEIGHT = 360
 """Pixels of a picture's height at most."""
@@ -29,12 +29,12 @@ def draw_overlays(
         (name, frame)
         for name, motion in capture.motions.items()
         for frame in range(len(motion))
-        if capture.seen_by(name, frame)
+        if capture.cameras_with_image(name, frame)
     }
-    reading, places = read(capture), choose_frames(capture.motions, seen)
+    hypothesis, places = read(capture), choose_frames(capture.motions, seen)
     rows = {
         capture.cameras[index].name: [
-            _draw(capture, reading.vertices(*place), *place, index) for place in places
+            _draw(capture, hypothesis.vertices(*place), *place, index) for place in places
         ]
         for index in range(len(capture.cameras))
     }
@@ -48,7 +48,7 @@ def _draw(
     reduction = -(-camera.height // HEIGHT)
     height, width = camera.height // reduction, camera.width // reduction
     white = np.full((height, width, 3), 255, np.uint8)
-    if index not in capture.seen_by(sequence, frame):
+    if index not in capture.cameras_with_image(sequence, frame):
         return white
     try:
         image = capture.image(sequence, frame, index)

@@ -13,33 +13,33 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dsar.body.files import load_hands
-from dsar.data.divergence import FAR, NEAR, divergence
-from dsar.data.multiview import MultiViewCapture
-from dsar.data.novelty import joint_speeds
+from dsar.data.captures.multiview import MultiViewCapture
+from dsar.data.motions.mmd import FAR, NEAR, motion_mmd
+from dsar.data.motions.out_of_distribution import joint_speeds
 from dsar.errors import BodyError, CaptureError
-from dsar.evaluation.check import content
-from dsar.evaluation.check.agreement import (
-    FINE,
-    Agreement,
-    Mask,
-    Reading,
-    around_hands,
-    compare,
-    errors,
-    load_masks,
-    read,
+from dsar.evaluation.check import image_summaries
+from dsar.evaluation.check.faults import (
+    Candidate,
+    coarse_faults,
+    control_hypotheses,
+    find_fault,
+    half_pixel_faults,
+    hand_faults,
+    is_significantly_smaller,
 )
 from dsar.evaluation.check.finding import Finding
-from dsar.evaluation.check.mistakes import (
-    Suspect,
-    coarse_mistakes,
-    controls,
-    find_mistake,
-    half_pixels,
-    hand_mistakes,
-    is_clearer,
+from dsar.evaluation.check.image_findings import find_color_faults, find_mask_faults
+from dsar.evaluation.check.silhouettes import (
+    FINE,
+    Hypothesis,
+    Mask,
+    SilhouetteAgreement,
+    compare,
+    crop_to_hands,
+    load_masks,
+    read,
+    silhouette_errors,
 )
-from dsar.evaluation.check.pictures import judge_colors, judge_masks
 
 APART = 0.5
 """Share of the body in the masks below which a capture cannot train."""
@@ -50,7 +50,7 @@ _GROSS = 0.1
 _FINE_CAMERAS = 8
 _UNUSUAL = (1.3, 0.03)
 """How many times the median camera's error one must have to be suspect, and how much more."""
-_MENDED = 0.5
+_EXPLAINED = 0.5
 """Share of an error below which its cause is found."""
 _LATEST = 5
 _LISTED = 5
@@ -59,7 +59,7 @@ Reporter = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)
-class CameraVerdict:
+class CameraAgreement:
     """How one camera's images agree with the body."""
 
     name: str
@@ -74,10 +74,10 @@ class CameraVerdict:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class CaptureVerdict:
     """What `dsar check` found."""
 
-    cameras: Sequence[CameraVerdict]
+    cameras: Sequence[CameraAgreement]
     findings: Sequence[Finding]
     figures: Mapping[str, Any] = field(default_factory=dict)
     """Speeds, duplicates, divergence of the test sequences, sizes."""
@@ -92,47 +92,48 @@ class Verdict:
         return {**dataclasses.asdict(self), "fatal": self.fatal}
 
 
-def check_capture(capture: MultiViewCapture, report: Reporter = lambda *_: None) -> Verdict:
+def check_capture(capture: MultiViewCapture, report: Reporter = lambda *_: None) -> CaptureVerdict:
     """Read all of a capture and return what is wrong with it.
 
     Raises:
         CaptureError: no image at all can be read.
     """
     findings, figures = [], {}
-    total, pictures, began = content.count_images(capture), [], time.monotonic()
-    for picture in content.read_pictures(capture):
-        pictures.append(picture)
-        report("read images", 0.8 * len(pictures) / max(total, 1))
-    readable = [picture for picture in pictures if picture.broken is None]
+    total, summaries, began = image_summaries.count_images(capture), [], time.monotonic()
+    for summary in image_summaries.summarize_images(capture):
+        summaries.append(summary)
+        report("read images", 0.8 * len(summaries) / max(total, 1))
+    readable = [summary for summary in summaries if summary.broken is None]
     if not readable:
         raise CaptureError(
-            f"capture {capture.name}: none of its {total} images can be read; the first: {pictures[0].broken}"
+            f"capture {capture.name}: none of its {total} images can be read; the first: "
+            f"{summaries[0].broken}"
         )
-    findings += _judge_pictures(capture, pictures)
+    findings += _image_findings(capture, summaries)
     figures["read_ms"] = 1e3 * (time.monotonic() - began) / total
-    figures |= _describe(capture, pictures)
+    figures |= _describe(capture, summaries)
     report("compare body and masks", 0.8)
     usable = {(p.sequence, p.frame, p.camera) for p in readable if p.coverage > 0 and not p.full}
-    findings += judge_colors(capture, readable, usable)
-    findings += _judge_gaps(capture, {(picture.sequence, picture.frame) for picture in readable})
-    masks, reading = load_masks(capture, usable), read(capture)
-    agreements = list(compare(reading, masks))
+    findings += find_color_faults(capture, readable, usable)
+    findings += _gap_findings(capture, {(summary.sequence, summary.frame) for summary in readable})
+    masks, hypothesis = load_masks(capture, usable), read(capture)
+    agreements = list(compare(hypothesis, masks))
     if masks and not any(finding.name == "masks_inverted" for finding in findings):
-        findings += _judge_agreement(capture, reading, masks, agreements)
+        findings += _agreement_findings(capture, hypothesis, masks, agreements)
         report("look for fine mistakes", 0.95)
         if not any(finding.fatal for finding in findings):
             some = min(_FINE_CAMERAS, len(capture.cameras))
-            findings += _judge_details(capture, reading, load_masks(capture, usable, FINE, some))
+            findings += _fine_findings(capture, hypothesis, load_masks(capture, usable, FINE, some))
     # In other units every step is a jump.
     if not any(finding.name.startswith("motion_in") for finding in findings):
         findings += [
             Finding("jumps", f"sequence {name}: the body jumps at frame {_list(frames)}; cut it there")
-            for name, frames in content.count_jumps(capture).items()
+            for name, frames in image_summaries.count_jumps(capture).items()
         ]
-    return Verdict(_by_camera(capture, masks, agreements, pictures), findings, figures)
+    return CaptureVerdict(_by_camera(capture, masks, agreements, summaries), findings, figures)
 
 
-def _judge_gaps(capture: MultiViewCapture, seen: Collection[tuple[str, int]]) -> list[Finding]:
+def _gap_findings(capture: MultiViewCapture, seen: Collection[tuple[str, int]]) -> list[Finding]:
     """Return which sequences have frames that no camera saw."""
     findings = []
     for name, motion in capture.motions.items():
@@ -145,14 +146,16 @@ def _judge_gaps(capture: MultiViewCapture, seen: Collection[tuple[str, int]]) ->
     return findings
 
 
-def _judge_pictures(capture: MultiViewCapture, pictures: Sequence[content.Picture]) -> list[Finding]:
+def _image_findings(
+    capture: MultiViewCapture, summaries: Sequence[image_summaries.ImageSummary]
+) -> list[Finding]:
     findings = []
-    broken = [picture.broken for picture in pictures if picture.broken is not None]
+    broken = [summary.broken for summary in summaries if summary.broken is not None]
     if broken:
         what = f"{len(broken)} images cannot be used; the first: {broken[0]}"
         findings.append(Finding("broken_images", what, True))
-    findings += judge_masks(capture, [picture for picture in pictures if picture.broken is None])
-    for camera, count in sorted(content.count_duplicates(capture, pictures).items()):
+    findings += find_mask_faults(capture, [summary for summary in summaries if summary.broken is None])
+    for camera, count in sorted(image_summaries.count_duplicates(capture, summaries).items()):
         findings.append(
             Finding(
                 "duplicate_frames",
@@ -163,19 +166,24 @@ def _judge_pictures(capture: MultiViewCapture, pictures: Sequence[content.Pictur
     return findings
 
 
-def _judge_agreement(
-    capture: MultiViewCapture, reading: Reading, masks: Sequence[Mask], agreements: Sequence[Agreement]
+def _agreement_findings(
+    capture: MultiViewCapture,
+    hypothesis: Hypothesis,
+    masks: Sequence[Mask],
+    agreements: Sequence[SilhouetteAgreement],
 ) -> list[Finding]:
     """Return what body and masks say of cameras, motion and numbering."""
     inside = statistics.fmean(each.inside for each in agreements)
     before = np.array([each.error for each in agreements])
-    suspect = find_mistake(reading, masks, coarse_mistakes(capture.turn), before)
+    candidate = find_fault(hypothesis, masks, coarse_faults(capture.turn), before)
     apart = inside < APART
     # A body that is drawn too small lies in the mask, and is as wrong as one beside it.
-    gross = suspect is not None and not suspect.mistake.shift and suspect.before - suspect.after > _GROSS
-    findings = [_of_suspect(suspect, apart or gross)] if suspect else []
-    if suspect is None or suspect.mistake.name.startswith("frame_offset"):
-        findings += _judge_cameras(capture, reading, masks, before)
+    gross = (
+        candidate is not None and not candidate.fault.shift and candidate.before - candidate.after > _GROSS
+    )
+    findings = [_candidate_finding(candidate, apart or gross)] if candidate else []
+    if candidate is None or candidate.fault.name.startswith("frame_offset"):
+        findings += _camera_findings(capture, hypothesis, masks, before)
     if not findings and inside < POOR:
         what = f"only {inside:.0%} of the body is in the masks"
         findings.append(
@@ -189,8 +197,8 @@ def _judge_agreement(
     return findings
 
 
-def _judge_cameras(
-    capture: MultiViewCapture, reading: Reading, masks: Sequence[Mask], before: np.ndarray
+def _camera_findings(
+    capture: MultiViewCapture, hypothesis: Hypothesis, masks: Sequence[Mask], before: np.ndarray
 ) -> list[Finding]:
     """Return which cameras agree much less than the others, and whose images theirs are."""
     index = np.array([mask.camera for mask in masks])
@@ -201,19 +209,21 @@ def _judge_cameras(
         if mean < _UNUSUAL[0] * usual or mean < usual + _UNUSUAL[1]:
             continue
         own = [mask for mask in masks if mask.camera == camera]
-        late = {k: errors(reading, own, k).mean() for k in range(-_LATEST, _LATEST + 1)}
+        late = {k: silhouette_errors(hypothesis, own, k).mean() for k in range(-_LATEST, _LATEST + 1)}
         others = {
-            k: errors(dataclasses.replace(reading, cameras={camera: reading.cameras[k]}), own).mean()
-            for k in reading.cameras
+            k: silhouette_errors(
+                dataclasses.replace(hypothesis, cameras={camera: hypothesis.cameras[k]}), own
+            ).mean()
+            for k in hypothesis.cameras
             if k != camera
         }
         best = min(others, key=lambda k: others[k])
         shift = min(late, key=lambda k: late[k])
         name = capture.cameras[camera].name
-        if others[best] < _MENDED * mean and others[best] < late[shift]:
+        if others[best] < _EXPLAINED * mean and others[best] < late[shift]:
             what = f"the images of {name} are those of {capture.cameras[best].name}: exchange their folders"
             findings.append(Finding("cameras_swapped", what))
-        elif shift and late[shift] - usual < _MENDED * (mean - usual):
+        elif shift and late[shift] - usual < _EXPLAINED * (mean - usual):
             how = f"{abs(shift)} frames {'ahead' if shift > 0 else 'late'}"
             findings.append(
                 Finding("camera_late", f"the images of {name} are {how}: number them as the others")
@@ -224,20 +234,23 @@ def _judge_cameras(
     return findings
 
 
-def _judge_details(capture: MultiViewCapture, reading: Reading, masks: Sequence[Mask]) -> list[Finding]:
+def _fine_findings(capture: MultiViewCapture, hypothesis: Hypothesis, masks: Sequence[Mask]) -> list[Finding]:
     """Return what shows at full resolution only."""
-    suspects = []
-    suspect = find_mistake(reading, masks, half_pixels(), errors(reading, masks))
-    if suspect is not None:
+    candidates = []
+    candidate = find_fault(hypothesis, masks, half_pixel_faults(), silhouette_errors(hypothesis, masks))
+    if candidate is not None:
         # A fit that is a little off gains by a move in other directions too.
-        after = errors(suspect.mistake.mend(reading), masks)
-        if all(is_clearer(errors(other, masks), after) for other in controls(reading)):
-            suspects.append(suspect)
-    hands = around_hands(reading, masks)
+        after = silhouette_errors(candidate.fault.undo(hypothesis), masks)
+        if all(
+            is_significantly_smaller(silhouette_errors(other, masks), after)
+            for other in control_hypotheses(hypothesis)
+        ):
+            candidates.append(candidate)
+    hands = crop_to_hands(hypothesis, masks)
     if hands:
-        mistakes = hand_mistakes(_mean_hands(capture))
-        suspects.append(find_mistake(reading, hands, mistakes, errors(reading, hands)))
-    return [_of_suspect(suspect, fatal=False) for suspect in suspects if suspect is not None]
+        faults = hand_faults(_mean_hands(capture))
+        candidates.append(find_fault(hypothesis, hands, faults, silhouette_errors(hypothesis, hands)))
+    return [_candidate_finding(candidate, fatal=False) for candidate in candidates if candidate is not None]
 
 
 def _mean_hands(capture: MultiViewCapture) -> Float[Tensor, "2 45"] | None:
@@ -247,12 +260,12 @@ def _mean_hands(capture: MultiViewCapture) -> Float[Tensor, "2 45"] | None:
         return None
 
 
-def _of_suspect(suspect: Suspect, fatal: bool) -> Finding:
-    share = f"{suspect.before:.3f} to {suspect.after:.3f}"
-    return Finding(suspect.mistake.name, f"{suspect.mistake.remedy} (the error falls from {share})", fatal)
+def _candidate_finding(candidate: Candidate, fatal: bool) -> Finding:
+    share = f"{candidate.before:.3f} to {candidate.after:.3f}"
+    return Finding(candidate.fault.name, f"{candidate.fault.remedy} (the error falls from {share})", fatal)
 
 
-def _describe(capture: MultiViewCapture, pictures: Sequence[content.Picture]) -> dict[str, Any]:
+def _describe(capture: MultiViewCapture, summaries: Sequence[image_summaries.ImageSummary]) -> dict[str, Any]:
     """Return what is known of motion and files without comparing them."""
     speeds = torch.cat([joint_speeds(capture.body, motion) for motion in capture.motions.values()])
     splits = capture.splits
@@ -260,7 +273,7 @@ def _describe(capture: MultiViewCapture, pictures: Sequence[content.Picture]) ->
     divergences = {}
     for name in splits["test"]:
         if len(capture.motions[name]) > 1:
-            found = divergence(capture.motions, splits["train"], [name])
+            found = motion_mmd(capture.motions, splits["train"], [name])
             label = "near" if found < NEAR else "far" if found > FAR else "between"
             divergences[name] = {"mmd": found, "mmd_squared": found**2, "label": label}
     return {
@@ -269,9 +282,10 @@ def _describe(capture: MultiViewCapture, pictures: Sequence[content.Picture]) ->
         "splits": {split: list(names) for split, names in splits.items()},
         "divergence": divergences,
         "fastest_joint_m_s": dict(zip(("p50", "p95", "p99.9"), map(float, percentiles), strict=True)),
-        "fastest_joint_histogram": content.histogram(speeds),
+        "fastest_joint_histogram": image_summaries.histogram(speeds),
         "duplicates": {
-            capture.cameras[k].name: count for k, count in content.count_duplicates(capture, pictures).items()
+            capture.cameras[k].name: count
+            for k, count in image_summaries.count_duplicates(capture, summaries).items()
         },
         "disk_bytes": sum(path.stat().st_size for path in capture.root.rglob("*") if path.is_file()),
     }
@@ -280,15 +294,15 @@ def _describe(capture: MultiViewCapture, pictures: Sequence[content.Picture]) ->
 def _by_camera(
     capture: MultiViewCapture,
     masks: Sequence[Mask],
-    agreements: Sequence[Agreement],
-    pictures: Sequence[content.Picture],
-) -> list[CameraVerdict]:
+    agreements: Sequence[SilhouetteAgreement],
+    summaries: Sequence[image_summaries.ImageSummary],
+) -> list[CameraAgreement]:
     frames, verdicts = sum(map(len, capture.motions.values())), []
     for index, camera in enumerate(capture.cameras):
         own = [each for mask, each in zip(masks, agreements, strict=True) if mask.camera == index]
-        count = sum(picture.camera == index for picture in pictures)
+        count = sum(summary.camera == index for summary in summaries)
         verdicts.append(
-            CameraVerdict(
+            CameraAgreement(
                 camera.name,
                 count,
                 frames - count,

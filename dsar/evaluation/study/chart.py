@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from dsar.drafts import replacing
+from dsar.atomic_files import atomic_write
 from dsar.errors import MissingDependencyError
 
 PAPER = {
@@ -47,7 +47,7 @@ class Point:
     """By quality: half of what its seeds part by; of models with several."""
 
 
-def points_of(summary: Mapping[str, Any]) -> list[Point]:
+def chart_points(summary: Mapping[str, Any]) -> list[Point]:
     """Return the models of a study's summary that were measured whole and trained as long, each once."""
     found: dict[str, Point] = {}
     for row in _rows(summary):
@@ -60,7 +60,7 @@ def points_of(summary: Mapping[str, Any]) -> list[Point]:
     return list(found.values())
 
 
-def times_of(summary: Mapping[str, Any]) -> dict[str, list[tuple[float, float]]]:
+def training_time_series(summary: Mapping[str, Any]) -> dict[str, list[tuple[float, float]]]:
     """Return minutes of training and PSNR in the box of each model that was trained for several times."""
     found: dict[str, dict[float, float]] = {}
     labels: dict[str, str] = {}
@@ -103,7 +103,7 @@ def draw_chart(
 
     Args:
         points: The models.
-        times: Minutes of training and PSNR by model, from `times_of`.
+        times: Minutes of training and PSNR by model, from `training_time_series`.
         path: .svg, .png or any other format that matplotlib writes.
 
     Raises:
@@ -129,7 +129,7 @@ def draw_chart(
     # Places in the picture are known only now.
     for column, quality in enumerate(QUALITIES):
         _name_models(panels[0][column], points, quality)
-    with replacing(path) as draft:
+    with atomic_write(path) as draft:
         figure.savefig(draft, format=path.suffix.lstrip(".").lower() or None)
     return path
 

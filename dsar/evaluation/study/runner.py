@@ -11,8 +11,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from dsar.atomic_files import write_text_atomically
 from dsar.config import PRESETS, TrainConfig, absolute_capture, config_to_json
-from dsar.drafts import write_whole
 from dsar.errors import ConfigError
 from dsar.evaluation.heldout import evaluate
 from dsar.evaluation.stress import CASES, Case, stress
@@ -184,7 +184,7 @@ class Study:
             found |= {"updates": read_progress(run)["step"], **evaluate(avatar, capture, streams=streams)}
             if battery is not None:
                 found["stress"] = battery.result()
-        write_whole(self._figures(each), json.dumps(found, indent=1) + "\n")
+        write_text_atomically(self._figures(each), json.dumps(found, indent=1) + "\n")
 
 
 def _stress(folder: Path, cases: Mapping[str, Case]) -> dict[str, Any]:

@@ -41,7 +41,11 @@ class Table:
 _NO_FEEDBACK: _Settings = {"model.feedback": 0}
 _NO_BANK: _Settings = {"model.memory": 0}
 # Lags and acceleration are velocities in disguise.
-_NO_VELOCITY: _Settings = {"model.velocity": False, "model.acceleration": False, "model.lags": ()}
+_NO_VELOCITY: _Settings = {
+    "model.velocity": False,
+    "model.acceleration": False,
+    "model.mean_time_constants": (),
+}
 _WINDOW_ONLY: _Settings = {**_NO_FEEDBACK, **_NO_BANK}
 _POSE_ONLY: _Settings = {
     **_WINDOW_ONLY,
@@ -150,13 +154,13 @@ ABLATIONS: dict[str, Table] = {
             Row("all of it", seeds=3),
             Row("the paper's wiring", {"model.wiring": "shared"}),
             Row("late wiring", {"model.wiring": "late"}),
-            Row("without lags", {"model.lags": ()}),
+            Row("without lags", {"model.mean_time_constants": ()}),
             Row("without acceleration", {"model.acceleration": False}),
-            Row("without the map of identities", {"model.identity_channels": 0}),
-            Row("without registration", {"schedule.imitation_share": 0.0, "loss.registered": 0.0}),
+            Row("without the map of identities", {"model.uv_feature_channels": 0}),
+            Row("without registration", {"schedule.pretraining_fraction": 0.0, "loss.registered": 0.0}),
             Row("without a smooth template", {"loss.shape": 0.0}),
-            Row("without mirrored rollouts", {"schedule.mirrored": 0.0}),
-            Row("Adam alone", {"schedule.matrix_rate": 0.0}, seeds=3),
+            Row("without mirrored rollouts", {"schedule.mirrored_fraction": 0.0}),
+            Row("Adam alone", {"schedule.muon_rate": 0.0}, seeds=3),
         ),
     ),
     "sizes": Table(
@@ -207,7 +211,7 @@ BASELINES: dict[str, Table] = {
             Row("pose, linear bases (the paradigm of MMLPs)", {**_POSE_ONLY, "model.bases": 30}),
             Row(
                 "pose features at each Gaussian (the paradigm of GaussianAvatar)",
-                {**_POSE_ONLY, "model.channels": (64,), "model.identity_channels": 32},
+                {**_POSE_ONLY, "model.channels": (64,), "model.uv_feature_channels": 32},
             ),
         ),
     ),

@@ -13,7 +13,7 @@ from dsar_exporters.color import ColorTarget
 from dsar_exporters.exr.cryptomatte import matte_channels
 
 _HALF_MAX = 65504.0
-NOTHING = np.uint32(0xFFFFFFFF)
+NO_GAUSSIAN = np.uint32(0xFFFFFFFF)
 """`id` where no Gaussian was hit; 0 is the first one's."""
 Channels = dict[str, np.ndarray]
 """By name; arrays of three axes are groups such as `RGBA`."""
@@ -36,8 +36,8 @@ def data_channels(picture: Picture, layers: Collection[str]) -> Channels:
     channels: Channels = {}
     if "Z" in layers:
         channels["Z"] = _array(picture.output.depth)
-        if picture.output.front_depth is not None:
-            channels["front.Z"] = _array(picture.output.front_depth)
+        if picture.output.first_hit_depth is not None:
+            channels["front.Z"] = _array(picture.output.first_hit_depth)
     if "N" in layers:
         channels |= _split("N", "XYZ", _found("N", aovs.normals))
     if "P" in layers:
@@ -48,8 +48,8 @@ def data_channels(picture: Picture, layers: Collection[str]) -> Channels:
         channels |= _split("forward", "uv", _found("motion", aovs.forward) * upwards)
         channels |= _split("backward", "uv", _found("motion", aovs.backward) * upwards)
     if "id" in layers:
-        ids = _found("id", picture.output.heaviest).numpy()
-        channels["id"] = np.where(ids < 0, NOTHING, ids.astype(np.uint32))
+        ids = _found("id", picture.output.largest_weight_id).numpy()
+        channels["id"] = np.where(ids < 0, NO_GAUSSIAN, ids.astype(np.uint32))
     if "crypto" in layers:
         _require_any("crypto", bool(aovs.coverage))
         channels |= matte_channels(aovs.coverage)

@@ -16,7 +16,7 @@ _LINES_OF_CHUNK = (1, 1, 1, 16, 32, 16, 32, 32, 32, 256)
 _DEEP = b"deepscanline"
 
 
-def is_whole(path: Path) -> bool:
+def is_complete(path: Path) -> bool:
     """Return whether a file that was just written ends where its last chunk does.
 
     Args:

@@ -7,13 +7,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from dsar.drafts import replacing
+from dsar.atomic_files import atomic_write
 from dsar.errors import ExportError, StorageError
 from dsar.types import Camera, Picture
 from dsar_exporters.checks import check_name
 from dsar_exporters.color import ColorTarget
 from dsar_exporters.exr.channels import color_channels, crop, data_channels
-from dsar_exporters.exr.completeness import is_whole
+from dsar_exporters.exr.completeness import is_complete
 from dsar_exporters.exr.cryptomatte import matte_metadata
 from dsar_exporters.exr.deep import deep_channels
 from dsar_exporters.exr.header import NO_COLOR, Window, make_header, openexr
@@ -167,9 +167,9 @@ def write_parts(path: Path, parts: Sequence[Any]) -> None:
     Raises:
         StorageError: The disk does not take it.
     """
-    with replacing(path) as draft:
+    with atomic_write(path) as draft:
         openexr().File(list(parts)).write(str(draft))
-        if not is_whole(draft):
+        if not is_complete(draft):
             raise StorageError(f"{path}: the disk did not take its end: free some room, or write elsewhere")
 
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32
 
-from dsar.geometry.rates import exact_rate
+from dsar.geometry.frame_rates import exact_rate
 from dsar.types import Camera, Picture
 from dsar_exporters.optional import require
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar
 
-from dsar.drafts import replacing
+from dsar.atomic_files import atomic_write
 from dsar.types import Gaussians, GaussianSequence
 from dsar_exporters.checks import check_file_name
 from dsar_exporters.delivery import Sink
@@ -58,7 +58,7 @@ class SplatSequence(ABC):
 
         def write(frame: int, gaussians: Gaussians) -> None:
             path = self.frame_path(frame)
-            with replacing(path) as draft:
+            with atomic_write(path) as draft:
                 self.write_frame(draft, gaussians, sequence, frame)
             self._written.append(path)
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from dsar.drafts import replacing
+from dsar.atomic_files import atomic_write
 from dsar.errors import ExportError
 from dsar.geometry.harmonics import C0
 from dsar.types import Gaussians, GaussianSequence
@@ -45,7 +45,7 @@ class GltfSnapshot:
             raise ExportError(f"{self.path}: expected a name ending in .glb: rename the output")
         fourdgs = require("fourdgs", feature="GLB", package="fourdgs", extra="ply")
         frames = sequence.frame_numbers[:1]
-        with replacing(self.path) as draft:
+        with atomic_write(self.path) as draft:
 
             def write(frame: int, gaussians: Gaussians) -> None:
                 if frame == frames[0]:

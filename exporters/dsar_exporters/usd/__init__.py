@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from dsar.drafts import quoted_error
+from dsar.atomic_files import find_quoted_os_error
 from dsar.errors import ExportError, MissingDependencyError
-from dsar.geometry.paths import TURNTABLE, CameraPath
+from dsar.geometry.camera_paths import TURNTABLE, CameraPath
 from dsar.types import Camera, Gaussians, GaussianSequence
 from dsar_exporters.checks import check_cameras, check_name
 from dsar_exporters.delivery import Sink, export
@@ -273,4 +273,6 @@ def _library_errors(path: Path) -> Iterator[None]:
         # Of a chain of errors the first is the cause; USD quotes its words.
         reasons = [each.commentary.strip() for each in error.args if hasattr(each, "commentary")]
         reason = (reasons or [str(error)])[0]
-        raise quoted_error(reason) or ExportError(f"{path}: USD could not write it: {reason}") from error
+        raise find_quoted_os_error(reason) or ExportError(
+            f"{path}: USD could not write it: {reason}"
+        ) from error

@@ -17,12 +17,12 @@ import torch
 from jaxtyping import Float32
 from pxr import Kind, Sdf, Usd, UsdGeom, Vt
 
-from dsar.geometry.paths import TURNTABLE, turntable
+from dsar.geometry.camera_paths import TURNTABLE, turntable
 from dsar.types import Camera, Gaussians, GaussianSequence
 from dsar_exporters.usd.body import BODY, MESH, BodyWriter
-from dsar_exporters.usd.cameras import define_camera, placement
+from dsar_exporters.usd.cameras import define_camera, world_matrix
 from dsar_exporters.usd.names import clips_folder, payload_path
-from dsar_exporters.usd.particles import INSTANCER, SPLATS, Frame, Level, ParticleWriter, levels_of
+from dsar_exporters.usd.particles import INSTANCER, SPLATS, Frame, Level, ParticleWriter, make_levels
 from dsar_exporters.usd.timeline import ClipTimeline, LayerTimeline, Timeline
 
 PROXY = "proxy"
@@ -136,7 +136,7 @@ class AssetWriter:
         """Author the prims of the Gaussians, and the variants that choose among them."""
         binding = self._sequence.binding
         points = gaussians.means if binding is None else binding.points
-        self._levels = levels_of(points.float().contiguous().numpy())
+        self._levels = make_levels(points.float().contiguous().numpy())
         timeline: Timeline = self._layer if self._clips is None else self._clips
         for level in self._levels:
             self._define_data(f"/{level.name}")
@@ -199,7 +199,7 @@ class AssetWriter:
         )
         for camera in cameras:
             place = define_camera(self._stage, scope.GetPath().AppendChild(camera.name), camera)
-            place.Set(placement(camera))
+            place.Set(world_matrix(camera))
         if sequence.binding is not None:
             width, height = (cameras[0].width, cameras[0].height) if cameras else _TURNTABLE_SIZE
             circling = turntable(
@@ -207,7 +207,7 @@ class AssetWriter:
             )
             place = define_camera(self._data, f"/{TURNTABLE}", circling.cameras[0])
             for frame, camera in zip(sequence.frame_numbers, circling.cameras, strict=True):
-                self._layer.sample(place, frame, placement(camera))
+                self._layer.sample(place, frame, world_matrix(camera))
             self._as_data(f"/{TURNTABLE}")
             prim = self._stage.DefinePrim(scope.GetPath().AppendChild(TURNTABLE))
             self._bring_in(prim, f"/{TURNTABLE}")

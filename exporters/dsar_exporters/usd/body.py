@@ -32,7 +32,7 @@ class BodyWriter:
         self._timeline, self._binding = timeline, binding
         body = binding.body
         self._influences = largest_influences(body.weights, _INFLUENCES)
-        self._turns = np.zeros((len(body.joints), 4))
+        self._rotations = np.zeros((len(body.joints), 4))
         points = body.vertices.float().numpy()
         self._boxes, self._holds = _boxes(points, *self._influences, len(body.joints))
         self._root = UsdSkel.Root.Define(stage, f"/{BODY}")
@@ -79,11 +79,13 @@ class BodyWriter:
         """Write the joints of a frame, the binding's `index`-th."""
         body, transforms = self._binding.body, self._binding.T_world_rest[index].double().numpy()
         local = _relative_to_parents(_joint_frames(body, transforms), body.parents)
-        turns = quaternion_from_matrix(torch.from_numpy(local[:, :3, :3])).numpy()
+        quaternions = quaternion_from_matrix(torch.from_numpy(local[:, :3, :3])).numpy()
         # The short way from the frame before, for applications that interpolate numbers and not rotations.
-        turns = np.where((turns * self._turns).sum(-1, keepdims=True) < 0, -turns, turns)
-        self._turns = turns
-        rotations = Vt.QuatfArray.FromNumpy(turns[:, [1, 2, 3, 0]].astype(np.float32))
+        quaternions = np.where(
+            (quaternions * self._rotations).sum(-1, keepdims=True) < 0, -quaternions, quaternions
+        )
+        self._rotations = quaternions
+        rotations = Vt.QuatfArray.FromNumpy(quaternions[:, [1, 2, 3, 0]].astype(np.float32))
         translations = Vt.Vec3fArray.FromNumpy(local[:, :3, 3].astype(np.float32))
         extent = Vt.Vec3fArray.FromNumpy(self._bounds(transforms))
         self._timeline.sample(self._motion.CreateTranslationsAttr(), frame, translations)

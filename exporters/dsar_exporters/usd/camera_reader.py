@@ -18,8 +18,8 @@ from jaxtyping import Float
 from pxr import Gf, Usd, UsdGeom
 
 from dsar.errors import ExportError
-from dsar.geometry.paths import START_FRAME, CameraPath
-from dsar.geometry.rates import exact_rate, same_rate
+from dsar.geometry.camera_paths import START_FRAME, CameraPath
+from dsar.geometry.frame_rates import exact_rate, same_rate
 from dsar.geometry.rotations import nearest_rotation
 from dsar.types import Camera
 from dsar_exporters.usd.stages import open_stage

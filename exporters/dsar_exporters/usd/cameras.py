@@ -18,7 +18,7 @@ _CLIPPING_RANGE_M = (0.01, 1000.0)
 
 
 def define_camera(stage: Usd.Stage, path: Sdf.Path | str, camera: Camera) -> Usd.Attribute:
-    """Author a camera's lens and return the attribute that places it; `placement` makes its values."""
+    """Author a camera's lens and return the attribute that places it; `world_matrix` makes its values."""
     prim = UsdGeom.Camera.Define(stage, path)
     K = camera.K.double().numpy()
     horizontal = camera.width * _FOCAL_LENGTH / K[0, 0]
@@ -34,7 +34,7 @@ def define_camera(stage: Usd.Stage, path: Sdf.Path | str, camera: Camera) -> Usd
     return prim.AddTransformOp().GetAttr()
 
 
-def placement(camera: Camera) -> Gf.Matrix4d:
+def world_matrix(camera: Camera) -> Gf.Matrix4d:
     """Return where a camera stands, as USD's row-vector matrix."""
     matrix = np.ascontiguousarray(world_from_camera(camera, "opengl").T)
     return Gf.Matrix4d(matrix.tolist())

@@ -34,11 +34,11 @@ def project_with_frustums(
 
 def _stage_from_world(stage: Usd.Stage) -> np.ndarray:
     """Return the matrix from metres, Y up, to what a stage says that it is in (column vectors)."""
-    turn = np.eye(4)
+    rotation = np.eye(4)
     if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z:
-        turn[1:3, 1:3] = [[0.0, -1.0], [1.0, 0.0]]
+        rotation[1:3, 1:3] = [[0.0, -1.0], [1.0, 0.0]]
     scale = 1 / UsdGeom.GetStageMetersPerUnit(stage)
-    return np.diag([scale, scale, scale, 1.0]) @ turn
+    return np.diag([scale, scale, scale, 1.0]) @ rotation
 
 
 def _projection(camera: UsdGeom.Camera, time: Usd.TimeCode, width: int, height: int) -> np.ndarray:

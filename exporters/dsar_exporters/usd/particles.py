@@ -83,7 +83,7 @@ class Frame:
             opacities=gaussians.opacities.numpy(),
             harmonics=gaussians.harmonics.numpy(),
             colors=linear_from_srgb(dc * np.float32(C0) + np.float32(0.5)),
-            reach=reach_of(gaussians.rotations.numpy(), gaussians.scales.numpy()),
+            reach=axis_extents(gaussians.rotations.numpy(), gaussians.scales.numpy()),
         )
 
     def bounds(self) -> Float32[np.ndarray, "2 3"]:
@@ -93,7 +93,7 @@ class Frame:
         return np.stack([(self.means - self.reach).min(0), (self.means + self.reach).max(0)])
 
 
-def levels_of(points: Float32[np.ndarray, "n 3"]) -> list[Level]:
+def make_levels(points: Float32[np.ndarray, "n 3"]) -> list[Level]:
     """Return the levels full, half and quarter of Gaussians that lie at these points at rest.
 
     The points are put in the order of a space-filling curve, of which every second or fourth is kept: thinned
@@ -220,10 +220,10 @@ class ParticleWriter:
             samples.append((splats.CreateOrientationsAttr(), rotations))
         for attribute, value in samples:
             self._timeline.sample(attribute, number, value)
-        self._write_looks(number, frame)
+        self._write_appearance(number, frame)
         return bounds
 
-    def _write_looks(self, number: int, frame: Frame) -> None:
+    def _write_appearance(self, number: int, frame: Frame) -> None:
         """Write what may stay the same over all frames."""
         precision = np.float16 if self._half else np.float32
         vectors, numbers = (Vt.Vec3hArray, Vt.HalfArray) if self._half else (Vt.Vec3fArray, Vt.FloatArray)
@@ -278,7 +278,7 @@ def _primvar(prim: Usd.Prim, name: str, kind: Sdf.ValueTypeName) -> Usd.Attribut
     return UsdGeom.PrimvarsAPI(prim).CreatePrimvar(name, kind, UsdGeom.Tokens.vertex).GetAttr()
 
 
-def reach_of(
+def axis_extents(
     rotations: Float32[np.ndarray, "n 4"], scales: Float32[np.ndarray, "n 3"]
 ) -> Float32[np.ndarray, "n 3"]:
     """Return how far three standard deviations extend along the world's axes, metres; quaternions are wxyz.

@@ -16,7 +16,7 @@ import numpy as np
 from pxr import Sdf, Tf, Usd, UsdGeom, UsdVol
 
 from dsar.errors import ExportError
-from dsar_exporters.usd.particles import EXTENT_SIGMAS, reach_of
+from dsar_exporters.usd.particles import EXTENT_SIGMAS, axis_extents
 from dsar_exporters.usd.stages import diagnostics_held, open_stage, reason
 
 _logger = logging.getLogger(__name__)
@@ -234,7 +234,7 @@ def _reach_faults(fields: _Fields, at: str) -> Iterator[str]:
     if fields.extent is None:
         return
     rotations = fields.rotations / np.linalg.norm(fields.rotations, axis=1, keepdims=True)
-    reach = reach_of(rotations, fields.scales)
+    reach = axis_extents(rotations, fields.scales)
     low, high = (fields.positions - reach).min(0), (fields.positions + reach).max(0)
     slack = _REACH + 2e-3 * float(fields.scales.max())
     if (fields.extent[0] > low + slack).any() or (fields.extent[1] < high - slack).any():

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dsar.geometry.cameras import look_at, spread_out
+from dsar.geometry.cameras import farthest_cameras, look_at
 from dsar.raster import rasterize
 from dsar.types import Camera, Gaussians
 from dsar_render.crosscheck import proxies, splats
@@ -18,13 +18,13 @@ from dsar_render.crosscheck.mistakes import MISTAKES, name_mistake
 from dsar_render.crosscheck.points import (
     Projection,
     Residuals,
-    Sightings,
-    sight_spheres,
-    through_camera,
-    through_matrix,
+    SphereObservations,
+    camera_projection,
+    matrix_projection,
+    project_spheres,
 )
 from dsar_render.crosscheck.proxies import Agreement, Hits, MitsubaScene, Shape
-from dsar_render.crosscheck.verdict import CameraVerdict, Image, SplatVerdict, Verdict
+from dsar_render.crosscheck.verdict import CameraAgreement, Image, SplatVerdict, Verdict
 
 Reporter = Callable[[str, float], None]
 
@@ -61,11 +61,11 @@ def cross_check(
     skipped: dict[str, str] = {}
     for index, camera in enumerate(cameras):
         report(camera.name, index / (len(cameras) + 2))
-        sources = {"ours": through_camera(camera)}
-        sources |= {kind: through_matrix(of[camera.name]) for kind, of in written.items()}
+        sources = {"ours": camera_projection(camera)}
+        sources |= {kind: matrix_projection(of[camera.name]) for kind, of in written.items()}
         view = _proxy_view(camera)
         ours, theirs = proxies.see(shapes, view), scene.see(view)
-        verdict = _judge(camera, sight_spheres(mi, camera), sources, proxies.compare(ours, theirs))
+        verdict = _judge(camera, project_spheres(mi, camera), sources, proxies.compare(ours, theirs))
         # The first, and every one that is wrong.
         if index == 0 or verdict.faults:
             pictures[f"proxies, {camera.name}"] = _proxy_pictures(ours, theirs)
@@ -98,36 +98,39 @@ def seed_mistakes(mi: Any, camera: Camera) -> dict[str, str | None]:
     K = torch.tensor([[1.1 * width, 0.0, 0.57 * width], [0.0, 1.3 * width, 0.46 * height], [0.0, 0.0, 1.0]])
     T = look_at(np.array([1.3, 0.9, 2.6]), np.array([0.1, -0.3, 0.2]))
     probe = Camera(K, _rolled(T, 0.2), width, height, "probe")
-    sightings = sight_spheres(mi, probe)
+    observations = project_spheres(mi, probe)
     return {
-        each.name: find_fault(probe, sightings, through_camera(each.variants[0](probe))) for each in MISTAKES
+        each.name: find_fault(probe, observations, camera_projection(each.variants[0](probe)))
+        for each in MISTAKES
     }
 
 
-def find_fault(camera: Camera, sightings: Sightings, source: Projection) -> str | None:
+def find_fault(camera: Camera, observations: SphereObservations, source: Projection) -> str | None:
     """Return the mistake that a projection has made, `unknown` if it is none of the usual; None if none.
 
     Args:
         camera: The right one.
-        sightings: Through it.
+        observations: Through it.
         source: What is tried.
     """
-    if Residuals.of(sightings.residuals(source)).rms <= TOLERANCE_PX:
+    if Residuals.from_distances(observations.residuals(source)).rms <= TOLERANCE_PX:
         return None
     # Where Mitsuba itself sees them elsewhere, the mistake is in what it was told.
-    own = Residuals.of(sightings.residuals(through_camera(camera)))
-    places = source(sightings.points) if own.rms <= TOLERANCE_PX else sightings.pixels
-    mistake = name_mistake(camera, sightings.points, places, TOLERANCE_PX)
+    own = Residuals.from_distances(observations.residuals(camera_projection(camera)))
+    places = source(observations.points) if own.rms <= TOLERANCE_PX else observations.pixels
+    mistake = name_mistake(camera, observations.points, places, TOLERANCE_PX)
     return mistake.name if mistake else "unknown"
 
 
 def _judge(
-    camera: Camera, sightings: Sightings, sources: Mapping[str, Projection], proxy: Agreement
-) -> CameraVerdict:
-    residuals = {name: Residuals.of(sightings.residuals(source)) for name, source in sources.items()}
-    faults = {name: find_fault(camera, sightings, source) for name, source in sources.items()}
+    camera: Camera, observations: SphereObservations, sources: Mapping[str, Projection], proxy: Agreement
+) -> CameraAgreement:
+    residuals = {
+        name: Residuals.from_distances(observations.residuals(source)) for name, source in sources.items()
+    }
+    faults = {name: find_fault(camera, observations, source) for name, source in sources.items()}
     named = {name: fault for name, fault in faults.items() if fault is not None}
-    return CameraVerdict(camera.name, residuals, named, proxy)
+    return CameraAgreement(camera.name, residuals, named, proxy)
 
 
 def _compare_splats(
@@ -138,9 +141,9 @@ def _compare_splats(
     if not seeing:
         return None, {}
     decibels, coverage, explanations, pictures = [], [], {}, {}
-    for camera in spread_out(seeing, min(_CLOSEUPS, len(seeing))):
+    for camera in farthest_cameras(seeing, min(_CLOSEUPS, len(seeing))):
         view, small = _closeups(gaussians, camera)
-        few = splats.seen_by(gaussians, view)
+        few = splats.visible_from(gaussians, view)
         ours, theirs = rasterize(few, view), splats.GaussianScene(mi, few).trace(view)
         covered = splats.GaussianScene(mi, splats.white(few)).trace(view)[..., 0]
         decibels.append(splats.psnr(ours.color.numpy(), theirs.numpy()))
@@ -149,7 +152,7 @@ def _compare_splats(
         pictures[f"splats, {camera.name}"] = _triple(ours.color, theirs)
     _, small = _closeups(gaussians, seeing[0])
     # So few that they hardly hide each other: where they do, the orders differ, and so do right gradients.
-    few = splats.seen_by(gaussians, small)
+    few = splats.visible_from(gaussians, small)
     few = few.map(lambda values: values[:: max(1, len(values) // _APART)])
     pairs = splats.gradients(mi, few, small)
     slopes = {name: splats.correlation_and_slope(*pair) for name, pair in pairs.items()}
@@ -166,9 +169,9 @@ def _closeups(gaussians: Gaussians, camera: Camera) -> tuple[Camera, Camera]:
 
 def _rolled(T_camera_world: Float[Tensor, "4 4"], angle: float) -> Float[Tensor, "4 4"]:
     """Return the view of a camera turned about its axis, radians."""
-    turn = torch.eye(4)
-    turn[:2, :2] = torch.tensor([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
-    return turn @ T_camera_world
+    roll = torch.eye(4)
+    roll[:2, :2] = torch.tensor([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    return roll @ T_camera_world
 
 
 def _proxy_view(camera: Camera) -> Camera:

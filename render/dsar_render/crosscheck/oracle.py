@@ -38,7 +38,7 @@ class Choices:
 
 
 @dataclass(frozen=True)
-class Rung:
+class Step:
     """One more choice made as the ray tracer makes it."""
 
     name: str
@@ -48,12 +48,12 @@ class Rung:
 
 
 OURS = Choices()
-LADDER = (
-    Rung("low_pass", "splats are no longer widened by 0.3 pixels²", Choices(False)),
-    Rung("projection", "densest place along the ray, for a projected ellipse", Choices(False, False)),
-    Rung("view_directions", "colours along the ray, not to the centre", Choices(False, False, False)),
-    Rung("limits", "ends at 3 deviations and 1 % of light", Choices(False, False, False, False)),
-    Rung("order", "by where rays enter, not by centres", Choices(False, False, False, False, False)),
+STEPS = (
+    Step("low_pass", "splats are no longer widened by 0.3 pixels²", Choices(False)),
+    Step("projection", "densest place along the ray, for a projected ellipse", Choices(False, False)),
+    Step("view_directions", "colours along the ray, not to the centre", Choices(False, False, False)),
+    Step("limits", "ends at 3 deviations and 1 % of light", Choices(False, False, False, False)),
+    Step("order", "by where rays enter, not by centres", Choices(False, False, False, False, False)),
 )
 """From our choices to the ray tracer's."""
 

@@ -33,7 +33,7 @@ Projection = Callable[[Float[Tensor, "n 3"]], Float[Tensor, "n 2"]]
 
 
 @dataclass(frozen=True)
-class Sightings:
+class SphereObservations:
     """Where Mitsuba saw points."""
 
     points: Float[Tensor, "n 3"]
@@ -55,17 +55,17 @@ class Residuals:
     max: float
 
     @classmethod
-    def of(cls, distances: Float[Tensor, " n"]) -> "Residuals":
+    def from_distances(cls, distances: Float[Tensor, " n"]) -> "Residuals":
         """Return the figures of some distances."""
         return cls(float(distances.square().mean().sqrt()), float(distances.max()))
 
 
-def through_camera(camera: Camera) -> Projection:
+def camera_projection(camera: Camera) -> Projection:
     """Return our own projection."""
     return lambda points: project(camera, points)[0]
 
 
-def through_matrix(matrix: Float[np.ndarray, "4 4"]) -> Projection:
+def matrix_projection(matrix: Float[np.ndarray, "4 4"]) -> Projection:
     """Return the projection of a matrix for column vectors; rows 0, 1 and 3 are pixels times w, and w."""
     rows = torch.from_numpy(matrix)[[0, 1, 3]]
 
@@ -98,16 +98,16 @@ def place_spheres(camera: Camera, seed: int = 0) -> tuple[Float[Tensor, "n 3"], 
     return centers, radius * depths / (focal * _obliqueness(camera, centers))
 
 
-def sight_spheres(mi: Any, camera: Camera, seed: int = 0) -> Sightings:
+def project_spheres(mi: Any, camera: Camera, seed: int = 0) -> SphereObservations:
     """Return where Mitsuba sees spheres through a camera, in that camera's pixels."""
     shrink = min(1.0, _MOST_PIXELS / max(camera.width, camera.height))
     view = camera.resized(round(camera.width * shrink), round(camera.height * shrink))
     centers, radii = place_spheres(view, seed)
     square, taller = square_pixels(view)
     image = _render(mi, square, centers, radii)
-    pixels = _middles(image, len(centers), _apparent_area(square, centers, radii))
+    pixels = _centroids(image, len(centers), _apparent_area(square, centers, radii))
     size = torch.tensor([view.width / camera.width, taller * view.height / camera.height])
-    return Sightings(_apparent(view, centers, radii), pixels / size)
+    return SphereObservations(_apparent(view, centers, radii), pixels / size)
 
 
 def _render(
@@ -131,7 +131,7 @@ def _render(
     return np.array(mi.render(mi.load_dict(scene), spp=_SAMPLES))[..., :3]
 
 
-def _middles(
+def _centroids(
     image: Float[np.ndarray, "h w 3"], count: int, areas: Float[Tensor, " n"]
 ) -> Float[Tensor, "n 2"]:
     """Return the middle of each sphere's light."""
@@ -145,9 +145,9 @@ def _middles(
     which, weights, places = which[known], light[lit][known], places[lit][known]
     total = torch.zeros(count, dtype=torch.float64).index_add_(0, which, weights)
     sums = torch.zeros(count, 2, dtype=torch.float64).index_add_(0, which, weights[:, None] * places)
-    middles = sums / total[:, None]
-    middles[total < _SEEN * areas] = torch.inf
-    return middles
+    centroids = sums / total[:, None]
+    centroids[total < _SEEN * areas] = torch.inf
+    return centroids
 
 
 def _in_camera(camera: Camera, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
@@ -158,7 +158,7 @@ def _in_camera(camera: Camera, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n
 def _apparent(
     camera: Camera, centers: Float[Tensor, "n 3"], radii: Float[Tensor, " n"]
 ) -> Float[Tensor, "n 3"]:
-    """Return the world points that fall on the middles of the spheres' images."""
+    """Return the world points that fall on the centroids of the spheres' images."""
     local = _in_camera(camera, centers)
     local[:, 2] -= radii**2 / local[:, 2]
     transform = camera.T_camera_world.to(local)

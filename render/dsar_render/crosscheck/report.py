@@ -8,9 +8,9 @@ import numpy as np
 from jinja2 import Environment, StrictUndefined
 from PIL import Image
 
-from dsar.drafts import replacing
+from dsar.atomic_files import atomic_write
 from dsar_render.crosscheck.mistakes import MISTAKES
-from dsar_render.crosscheck.oracle import LADDER
+from dsar_render.crosscheck.oracle import STEPS
 from dsar_render.crosscheck.verdict import Verdict
 
 
@@ -21,10 +21,10 @@ def write_crosscheck_report(verdict: Verdict, path: Path) -> Path:
     facts = {
         "verdict": verdict,
         "what": {each.name: each.what for each in MISTAKES} | {"unknown": "none of the usual mistakes"},
-        "ladder": LADDER,
+        "steps": STEPS,
         "pictures": {name: [_embedded(image) for image in row] for name, row in verdict.pictures.items()},
     }
-    with replacing(path) as draft:
+    with atomic_write(path) as draft:
         draft.write_text(engine.from_string(source).render(facts), encoding="utf-8")
     return path
 

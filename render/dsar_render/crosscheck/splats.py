@@ -13,7 +13,7 @@ from torch import Tensor
 from dsar.geometry.cameras import project
 from dsar.raster import rasterize
 from dsar.types import Camera, Gaussians
-from dsar_render.crosscheck.oracle import EXTENT, LADDER, OURS, TRACED_STOP, blend
+from dsar_render.crosscheck.oracle import EXTENT, OURS, STEPS, TRACED_STOP, blend
 from dsar_render.crosscheck.sensors import make_sensor, pixel_centers, square_pixels
 
 _SCALE = 100.0
@@ -25,7 +25,7 @@ _WHITE = 0.5 / 0.28209479177387814
 
 
 @dataclass(frozen=True)
-class Step:
+class StepEffect:
     """One thing that renderers do differently, and what it changes."""
 
     name: str
@@ -41,7 +41,7 @@ class Explanation:
 
     ours: float
     """Mean absolute difference of our rasteriser and its definition."""
-    steps: tuple[Step, ...]
+    steps: tuple[StepEffect, ...]
     theirs: float
     """Mean absolute difference of Mitsuba and its definition: what is left unexplained."""
 
@@ -131,7 +131,7 @@ def closeup(gaussians: Gaussians, camera: Camera, size: int, pixels: float) -> C
     return near.cropped(left, top, size, size)
 
 
-def seen_by(gaussians: Gaussians, camera: Camera) -> Gaussians:
+def visible_from(gaussians: Gaussians, camera: Camera) -> Gaussians:
     """Return the Gaussians that may reach an image."""
     places, depth = project(camera, gaussians.means)
     reach = (EXTENT + 1) * gaussians.scales.amax(-1) * _focal(camera) / depth
@@ -142,14 +142,14 @@ def seen_by(gaussians: Gaussians, camera: Camera) -> Gaussians:
 
 def explain(mi: Any, gaussians: Gaussians, camera: Camera) -> Explanation:
     """Return what lies between our image of a small scene and Mitsuba's, one difference at a time."""
-    few = seen_by(gaussians, camera)
+    few = visible_from(gaussians, camera)
     found = blend(few, camera, OURS)[..., :3]
     ours = np.abs(found - rasterize(few, camera).color.double().numpy()).mean()
     steps = []
-    for rung in LADDER:
-        changed = blend(few, camera, rung.choices)[..., :3]
+    for step in STEPS:
+        changed = blend(few, camera, step.choices)[..., :3]
         change = float(np.abs(changed - found).mean())
-        steps.append(Step(rung.name, change, psnr(changed, found)))
+        steps.append(StepEffect(step.name, change, psnr(changed, found)))
         found = changed
     theirs = np.abs(found - GaussianScene(mi, few).trace(camera).double().numpy()).mean()
     return Explanation(float(ours), tuple(steps), float(theirs))

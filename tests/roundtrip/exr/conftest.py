@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 from exr_files import PROVENANCE
 
+from dsar.geometry.camera_paths import CameraPath
 from dsar.geometry.cameras import look_at
-from dsar.geometry.paths import CameraPath
 from dsar.types import Camera, Picture
 from dsar_render.aovs import AOVS
-from dsar_render.instants import Instant, iterate_instants
 from dsar_render.labels import Labels, label_parts
-from dsar_render.picture import RenderSettings, take_picture
+from dsar_render.picture import RenderSettings, render_picture
+from dsar_render.triplets import FrameTriplet, iterate_triplets
 
 
 @pytest.fixture(scope="module")
-def middle(figure) -> Instant:
-    return next(iter(iterate_instants(figure, {1003})))
+def middle(figure) -> FrameTriplet:
+    return next(iter(iterate_triplets(figure, {1003})))
 
 
 @pytest.fixture(scope="module")
@@ -34,10 +34,12 @@ def labels(figure) -> Labels:
 def take(middle, labels, front):
     """Return a function that takes pictures of the figure's middle frame."""
 
-    def taken(camera: Camera = front, instant: Instant = middle, fps: float = 24.0, **settings) -> Picture:
+    def taken(
+        camera: Camera = front, triplet: FrameTriplet = middle, fps: float = 24.0, **settings
+    ) -> Picture:
         found = RenderSettings(**({"aovs": AOVS} | settings))
         path = CameraPath((camera,))
-        return take_picture(instant, path, found, labels=labels, fps=fps, provenance=PROVENANCE)
+        return render_picture(triplet, path, found, labels=labels, fps=fps, provenance=PROVENANCE)
 
     return taken
 

@@ -45,7 +45,7 @@ def test_pixels_are_those_of_the_picture(picture, tmp_path):
     alpha = output.alpha.numpy()
     assert bits(found["A"]) == bits(alpha.astype(np.float16))
     assert bits(found["Z"]) == bits(output.depth.numpy())
-    assert bits(found["front.Z"]) == bits(output.front_depth.numpy())
+    assert bits(found["front.Z"]) == bits(output.first_hit_depth.numpy())
     for layer, values in (("N", aovs.normals), ("P", aovs.positions)):
         stored = np.stack([found[f"{layer}.{axis}"] for axis in "XYZ"], -1)
         np.testing.assert_array_equal(stored, values)
@@ -53,7 +53,7 @@ def test_pixels_are_those_of_the_picture(picture, tmp_path):
         np.testing.assert_array_equal(found[f"{layer}.u"], values[..., 0])
         # Ours point down, compositors' up.
         np.testing.assert_array_equal(found[f"{layer}.v"], -values[..., 1])
-    heaviest = output.heaviest.numpy()
+    heaviest = output.largest_weight_id.numpy()
     assert found["id"].dtype == np.uint32
     np.testing.assert_array_equal(found["id"], np.where(alpha > 0, heaviest, 0xFFFFFFFF))
     solid = alpha > 0.1

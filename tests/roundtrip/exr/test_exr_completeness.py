@@ -12,7 +12,7 @@ from faults import contents, full_disk
 
 from dsar.errors import StorageError
 from dsar_exporters import ColorTarget, ExrSequence
-from dsar_exporters.exr.completeness import is_whole
+from dsar_exporters.exr.completeness import is_complete
 
 
 @pytest.fixture(params=["zips", "dwaa", "multipart"])
@@ -83,12 +83,12 @@ def test_a_file_that_is_cut_off_anywhere_is_noticed(written, capfd):
 def test_the_end_of_a_file_is_found_wherever_it_is_cut(written):
     for path in written[1]:
         content = path.read_bytes()
-        assert is_whole(path)
+        assert is_complete(path)
         for missing in (*range(1, 30), *range(30, len(content), len(content) // 70)):
             os.truncate(path, len(content) - missing)
-            assert not is_whole(path), (path.name, missing)
+            assert not is_complete(path), (path.name, missing)
         path.write_bytes(content + b"0")
-        assert not is_whole(path)
+        assert not is_complete(path)
 
 
 @pytest.mark.parametrize("missing", [1, 10, 700, 3000, 5000])

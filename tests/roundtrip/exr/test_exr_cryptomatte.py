@@ -21,7 +21,7 @@ from exr_files import (
 
 from dsar.types import Aovs, Picture, RenderOutput
 from dsar_exporters.exr.cryptomatte import float_id, matte_channels
-from dsar_render.instants import iterate_instants
+from dsar_render.triplets import iterate_triplets
 
 
 def murmur(name: str) -> int:
@@ -174,8 +174,8 @@ def test_mattes_survive_every_way_of_writing(picture, tmp_path, settings):
 
 
 def test_blurred_mattes_sum_to_the_blurred_alpha(take, figure, tmp_path):
-    (instant,) = (each for each in iterate_instants(figure, {1003}) if each.frame == 1003)
-    blurred = take(instant=instant, motion_samples=3, shutter=(-0.5, 0.5))
+    (triplet,) = (each for each in iterate_triplets(figure, {1003}) if each.frame == 1003)
+    blurred = take(triplet=triplet, motion_samples=3, shutter=(-0.5, 0.5))
     found = decoded(write(tmp_path, blurred)[0])
     total = sum(found.matte(name) for name in found.manifest)
     np.testing.assert_allclose(total, blurred.output.alpha, atol=2e-6)

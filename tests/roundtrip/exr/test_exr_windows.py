@@ -20,7 +20,7 @@ from exr_files import (
 from dsar.geometry.cameras import project
 from dsar.types import Gaussians
 from dsar_exporters import ColorTarget, ExrSequence
-from dsar_render.instants import Instant
+from dsar_render.triplets import FrameTriplet
 
 
 def dot(place: torch.Tensor) -> Gaussians:
@@ -59,7 +59,7 @@ def test_the_headers_matrices_find_a_known_point(cameras, tmp_path, take, point,
     views = [*cameras, dataclasses.replace(cameras[0], T_camera_world=rolled, name="rolled")]
     seen = 0
     for view in views:
-        picture = take(view, Instant(1003, thing), aovs=("rgba", "Z", "P"), overscan=overscan)
+        picture = take(view, FrameTriplet(1003, thing), aovs=("rgba", "Z", "P"), overscan=overscan)
         pixel = project(view, place)[0]
         room = torch.tensor([view.width, view.height]) + overscan - 4
         if not ((pixel > 4 - overscan) & (pixel < room)).all():

@@ -10,20 +10,20 @@ from any_camera import random_camera
 
 from dsar.errors import ConfigError
 from dsar.geometry.cameras import project
-from dsar_exporters import write_usd, written_projections
+from dsar_exporters import read_back_projections, write_usd
 from dsar_exporters.projections import _speck as speck
 from dsar_exporters.usd import read_usd_projections
 from dsar_render.crosscheck.comparison import TOLERANCE_PX, find_fault, seed_mistakes
 from dsar_render.crosscheck.mistakes import MISTAKES, name_mistake
 from dsar_render.crosscheck.points import (
     Residuals,
-    Sightings,
-    _middles,
+    SphereObservations,
+    _centroids,
     _render,
+    camera_projection,
+    matrix_projection,
     place_spheres,
-    sight_spheres,
-    through_camera,
-    through_matrix,
+    project_spheres,
 )
 from dsar_render.crosscheck.sensors import square_pixels
 
@@ -31,26 +31,26 @@ from dsar_render.crosscheck.sensors import square_pixels
 @pytest.mark.parametrize("seed", range(20))
 def test_valid_cameras_agree_to_a_twentieth_of_a_pixel(scalar, seed):
     camera = random_camera(seed)
-    sightings = sight_spheres(scalar, camera, seed)
-    found = Residuals.of(sightings.residuals(through_camera(camera)))
+    observations = project_spheres(scalar, camera, seed)
+    found = Residuals.from_distances(observations.residuals(camera_projection(camera)))
     assert found.rms < 0.03
     assert found.max < 0.08
-    assert find_fault(camera, sightings, through_camera(camera)) is None
+    assert find_fault(camera, observations, camera_projection(camera)) is None
 
 
 def test_a_large_camera_agrees_as_well_though_it_is_looked_through_at_1024_pixels(scalar, oblong):
     large = oblong.resized(32 * oblong.width, 24 * oblong.height)
-    sightings = sight_spheres(scalar, large)
-    assert Residuals.of(sightings.residuals(through_camera(large))).rms < 0.05
+    observations = project_spheres(scalar, large)
+    assert Residuals.from_distances(observations.residuals(camera_projection(large))).rms < 0.05
     shifted = MISTAKES[0].variants[0](large)
-    assert find_fault(large, sightings, through_camera(large)) is None
-    assert find_fault(large, sightings, through_camera(shifted)) == "half_pixel_shift"
+    assert find_fault(large, observations, camera_projection(large)) is None
+    assert find_fault(large, observations, camera_projection(shifted)) == "half_pixel_shift"
 
 
 def test_files_project_as_mitsuba_sees(scalar, oblong):
-    sightings = sight_spheres(scalar, oblong)
-    for kind, projections in written_projections([oblong]).items():
-        found = Residuals.of(sightings.residuals(through_matrix(projections["oblong"])))
+    observations = project_spheres(scalar, oblong)
+    for kind, projections in read_back_projections([oblong]).items():
+        found = Residuals.from_distances(observations.residuals(matrix_projection(projections["oblong"])))
         assert found.rms < 0.03, kind
 
 
@@ -58,10 +58,10 @@ def test_files_project_as_we_do_in_every_place(oblong):
     random = torch.Generator().manual_seed(0)
     points = torch.randn(50, 3, generator=random, dtype=torch.float64) * 0.5
     ours, _ = project(oblong, points)
-    written = written_projections([oblong])
+    written = read_back_projections([oblong])
     assert set(written) == {"usd", "exr", "exr_lens"}
     for kind, projections in written.items():
-        theirs = through_matrix(projections["oblong"])(points)
+        theirs = matrix_projection(projections["oblong"])(points)
         torch.testing.assert_close(theirs, ours, atol=2e-4, rtol=0, msg=kind)
 
 
@@ -85,7 +85,7 @@ def test_every_way_to_make_a_mistake_has_its_name(mistake):
 
 def test_mistakes_in_matrices_made_by_hand_are_named(scalar, oblong):
     """As somebody writes them who has never seen ours."""
-    sightings = sight_spheres(scalar, oblong)
+    observations = project_spheres(scalar, oblong)
     K, T = oblong.K.double().numpy(), oblong.T_camera_world.double().numpy()
     (fx, _, cx), (_, fy, cy) = K[0], K[1]
 
@@ -106,8 +106,8 @@ def test_mistakes_in_matrices_made_by_hand_are_named(scalar, oblong):
         "camera_to_world": matrix(K, np.linalg.inv(T)),
         "centimetres": matrix(K, np.hstack([T[:, :3], T[:, 3:] * [[100], [100], [100], [1]]])),
     }
-    assert find_fault(oblong, sightings, through_matrix(matrix(K, T))) is None
-    found = {name: find_fault(oblong, sightings, through_matrix(each)) for name, each in wrong.items()}
+    assert find_fault(oblong, observations, matrix_projection(matrix(K, T))) is None
+    found = {name: find_fault(oblong, observations, matrix_projection(each)) for name, each in wrong.items()}
     assert found == {name: name for name in wrong}
 
 
@@ -118,34 +118,34 @@ def test_a_stage_that_says_it_is_in_other_units_is_caught(scalar, oblong, tmp_pa
     assert pxr
     path = write_usd(speck(), tmp_path / "stage.usda", name="stage", cameras=[oblong])
     sizes = {"oblong": (oblong.width, oblong.height)}
-    sightings = sight_spheres(scalar, oblong)
-    right = through_matrix(read_usd_projections(path, sizes)["oblong"])
-    assert find_fault(oblong, sightings, right) is None
+    observations = project_spheres(scalar, oblong)
+    right = matrix_projection(read_usd_projections(path, sizes)["oblong"])
+    assert find_fault(oblong, observations, right) is None
     stage = Usd.Stage.Open(str(path))
     UsdGeom.SetStageMetersPerUnit(stage, 0.01)
     stage.Save()
-    wrong = through_matrix(read_usd_projections(path, sizes)["oblong"])
-    assert find_fault(oblong, sightings, wrong) == "centimetres"
+    wrong = matrix_projection(read_usd_projections(path, sizes)["oblong"])
+    assert find_fault(oblong, observations, wrong) == "centimetres"
 
 
 def test_cameras_may_have_any_names(oblong):
     odd = [dataclasses.replace(oblong, name=name) for name in ("turntable", "Kamera ü", "0001")]
-    for projections in written_projections(odd).values():
+    for projections in read_back_projections(odd).values():
         assert set(projections) == {"turntable", "Kamera ü", "0001"}
 
 
 def test_what_is_no_usual_mistake_is_unknown(scalar, oblong):
     turned = oblong.T_camera_world.clone()
     turned[:3, 3] += torch.tensor([0.02, 0.0, 0.01])
-    sightings = sight_spheres(scalar, oblong)
+    observations = project_spheres(scalar, oblong)
     wrong = dataclasses.replace(oblong, T_camera_world=turned)
-    assert find_fault(oblong, sightings, through_camera(wrong)) == "unknown"
+    assert find_fault(oblong, observations, camera_projection(wrong)) == "unknown"
 
 
 def test_a_mistake_in_what_mitsuba_was_told_is_named_too(scalar, oblong):
     shifted = MISTAKES[0].variants[0](oblong)
-    sightings = sight_spheres(scalar, shifted)
-    assert find_fault(oblong, sightings, through_camera(oblong)) == "half_pixel_shift"
+    observations = project_spheres(scalar, shifted)
+    assert find_fault(oblong, observations, camera_projection(oblong)) == "half_pixel_shift"
 
 
 def test_points_that_mitsuba_does_not_see_are_infinitely_far(scalar, oblong):
@@ -154,13 +154,13 @@ def test_points_that_mitsuba_does_not_see_are_infinitely_far(scalar, oblong):
     narrow = oblong.cropped(0, 0, oblong.width // 2, oblong.height)
     image = _render(scalar, square_pixels(narrow)[0], centers, radii)
     areas = torch.full((len(centers),), math.pi * 9 * 150 / 172, dtype=torch.float64)
-    found = Sightings(centers, _middles(image, len(centers), areas))
-    distances = found.residuals(through_camera(square_pixels(narrow)[0]))
+    found = SphereObservations(centers, _centroids(image, len(centers), areas))
+    distances = found.residuals(camera_projection(square_pixels(narrow)[0]))
     columns, border = project(oblong, centers)[0][:, 0], oblong.width / 2
     assert 5 < int((columns < border - 4).sum()) < 20
     assert distances[columns < border - 4].isfinite().all()
     assert distances[columns > border + 4].isinf().all()
-    assert not np.isfinite(Residuals.of(distances).max)
+    assert not np.isfinite(Residuals.from_distances(distances).max)
 
 
 def test_a_camera_in_square_pixels_sees_the_same(oblong):

@@ -9,7 +9,7 @@ import torch
 
 from dsar.geometry.cameras import project
 from dsar.raster import rasterize
-from dsar_render.crosscheck.oracle import LADDER, OURS, blend
+from dsar_render.crosscheck.oracle import OURS, STEPS, blend
 from dsar_render.crosscheck.splats import (
     GaussianScene,
     closeup,
@@ -18,7 +18,7 @@ from dsar_render.crosscheck.splats import (
     explain,
     gradients,
     psnr,
-    seen_by,
+    visible_from,
     white,
 )
 
@@ -36,7 +36,7 @@ def test_the_definition_by_our_choices_is_our_rasteriser(cloud, small):
 
 
 def test_the_definition_by_the_tracers_choices_is_mitsuba(llvm, cloud, small):
-    found = blend(cloud, small, LADDER[-1].choices)
+    found = blend(cloud, small, STEPS[-1].choices)
     light = GaussianScene(llvm, cloud).trace(small).numpy()
     coverage = GaussianScene(llvm, white(cloud)).trace(small).numpy()[..., 0]
     assert np.abs(found[..., :3] - light).mean() < 2e-3
@@ -44,14 +44,14 @@ def test_the_definition_by_the_tracers_choices_is_mitsuba(llvm, cloud, small):
 
 
 def test_every_choice_changes_something(cloud, small):
-    images = [blend(cloud, small, OURS), *(blend(cloud, small, rung.choices) for rung in LADDER)]
+    images = [blend(cloud, small, OURS), *(blend(cloud, small, step.choices) for step in STEPS)]
     changes = [np.abs(two - one).mean() for one, two in pairwise(images)]
     assert min(changes) > 1e-5
 
 
 def test_the_difference_to_mitsuba_is_explained(llvm, cloud, small):
     found = explain(llvm, cloud, small)
-    assert [step.name for step in found.steps] == [rung.name for rung in LADDER]
+    assert [step.name for step in found.steps] == [step.name for step in STEPS]
     assert found.ours < 1e-4
     assert found.theirs < 2e-3
     # The whole difference is many times what is left unexplained.
@@ -60,7 +60,7 @@ def test_the_difference_to_mitsuba_is_explained(llvm, cloud, small):
 
 
 def test_a_low_pass_does_little_to_large_splats_and_much_to_small_ones(cloud, small):
-    without = next(rung.choices for rung in LADDER if rung.name == "low_pass")
+    without = next(step.choices for step in STEPS if step.name == "low_pass")
 
     def change(factor: float) -> float:
         sized = dataclasses.replace(cloud, scales=cloud.scales * factor)
@@ -71,7 +71,7 @@ def test_a_low_pass_does_little_to_large_splats_and_much_to_small_ones(cloud, sm
 
 def test_order_makes_no_difference_to_one_gaussian(cloud, small):
     few = cloud.map(lambda values: values[:1])
-    before, after = (blend(few, small, rung.choices) for rung in LADDER[-2:])
+    before, after = (blend(few, small, step.choices) for step in STEPS[-2:])
     assert np.array_equal(before, after)
 
 
@@ -81,7 +81,7 @@ def test_distance_does_not_matter(llvm, cloud, oblong):
     T[2, 3] += 20.0
     far = dataclasses.replace(oblong, T_camera_world=T)
     view = closeup(cloud, far, 48, 4.0)
-    few = seen_by(cloud, view)
+    few = visible_from(cloud, view)
     assert GaussianScene(llvm, few).trace(view).max() > 0.3
     assert psnr(rasterize(few, view).color.numpy(), GaussianScene(llvm, few).trace(view).numpy()) > 30
 
@@ -94,7 +94,7 @@ def test_a_camera_that_sees_none_has_no_closeup(cloud, oblong):
 
 def test_coverage_and_colours_agree_where_splats_are_some_pixels_large(llvm, cloud, oblong):
     view = closeup(cloud, oblong, 96, 4.0)
-    few = seen_by(cloud, view)
+    few = visible_from(cloud, view)
     ours = rasterize(few, view)
     theirs = GaussianScene(llvm, few).trace(view)
     covered = GaussianScene(llvm, white(few)).trace(view)[..., 0]
@@ -123,7 +123,7 @@ def test_a_closeup_shows_gaussians_as_large_as_asked(cloud, oblong):
 
 
 def test_what_no_ray_meets_is_left_out_and_changes_nothing(cloud, small):
-    few = seen_by(cloud, small)
+    few = visible_from(cloud, small)
     assert 0 < len(few) < len(cloud)
     torch.testing.assert_close(rasterize(few, small).color, rasterize(cloud, small).color, atol=1e-6, rtol=0)
 

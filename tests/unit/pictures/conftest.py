@@ -7,23 +7,23 @@ import pytest
 import torch
 from scenes import MIDDLE
 
+from dsar.geometry.camera_paths import CameraPath
 from dsar.geometry.cameras import look_at
-from dsar.geometry.paths import CameraPath
 from dsar.raster import rasterize
 from dsar.types import Camera, Contributors, GaussianSequence, Picture
 from dsar_render.aovs import AOVS
-from dsar_render.instants import Instant, iterate_instants
 from dsar_render.labels import Labels, label_parts
-from dsar_render.picture import RenderSettings, take_picture
+from dsar_render.picture import RenderSettings, render_picture
+from dsar_render.triplets import FrameTriplet, iterate_triplets
 
 
 @pytest.fixture(scope="module")
-def instants(figure: GaussianSequence) -> list[Instant]:
-    return list(iterate_instants(figure, figure.frame_numbers))
+def instants(figure: GaussianSequence) -> list[FrameTriplet]:
+    return list(iterate_triplets(figure, figure.frame_numbers))
 
 
 @pytest.fixture(scope="module")
-def middle(instants: list[Instant]) -> Instant:
+def middle(instants: list[FrameTriplet]) -> FrameTriplet:
     return instants[MIDDLE]
 
 
@@ -47,12 +47,12 @@ def moving(front: Camera) -> CameraPath:
 
 
 @pytest.fixture(scope="module")
-def everything(middle: Instant, still: CameraPath, labels: Labels) -> Picture:
-    return take_picture(middle, still, RenderSettings(AOVS), labels=labels)
+def everything(middle: FrameTriplet, still: CameraPath, labels: Labels) -> Picture:
+    return render_picture(middle, still, RenderSettings(AOVS), labels=labels)
 
 
 @pytest.fixture(scope="module")
-def blended(middle: Instant, front: Camera) -> Contributors:
+def blended(middle: FrameTriplet, front: Camera) -> Contributors:
     found = rasterize(middle.now, front, outputs=["contributors"]).contributors
     assert found is not None
     return found

@@ -16,8 +16,8 @@ from dsar.geometry.rotations import (
 from dsar.raster import rasterize
 from dsar.types import Gaussians
 from dsar_render.blending import blend_values
-from dsar_render.instants import Instant
-from dsar_render.picture import RenderSettings, take_picture
+from dsar_render.picture import RenderSettings, render_picture
+from dsar_render.triplets import FrameTriplet
 
 
 @pytest.mark.parametrize("channels", range(1, 8))
@@ -67,7 +67,7 @@ def test_the_normal_of_a_disc_is_its_axis_whichever_side_it_shows(front, still, 
     disc = Gaussians(
         torch.zeros(1, 3), rotation, torch.tensor([[0.2, 0.3, 0.001]]), torch.ones(1), torch.ones(1, 1, 3)
     )
-    normals = take_picture(Instant(1, disc), still, RenderSettings(("rgba", "N"))).aovs.normals
+    normals = render_picture(FrameTriplet(1, disc), still, RenderSettings(("rgba", "N"))).aovs.normals
     axis = matrix_from_quaternion(rotation)[0, :, 2]
     axis = axis * torch.sign((axis * front.center).sum())
     hit = normals.any(-1)
@@ -93,13 +93,13 @@ def test_front_depth_and_heaviest_are_those_of_the_contributors(everything, midd
             ids, weights = blended.ids[end - count : end], blended.weights[end - count : end]
             # `argmax` names the first of equals.
             nearest, heaviest = float(depth[ids].min()), int(ids[weights.argmax()])
-        assert float(everything.output.front_depth.flatten()[pixel]) == pytest.approx(nearest, abs=2e-6)
-        assert int(everything.output.heaviest.flatten()[pixel]) == heaviest
+        assert float(everything.output.first_hit_depth.flatten()[pixel]) == pytest.approx(nearest, abs=2e-6)
+        assert int(everything.output.largest_weight_id.flatten()[pixel]) == heaviest
 
 
 def test_only_what_was_asked_for_is_there(middle, still, labels):
-    picture = take_picture(middle, still, RenderSettings(("rgba",)), labels=labels)
+    picture = render_picture(middle, still, RenderSettings(("rgba",)), labels=labels)
     assert set(layers(picture)) == {"color", "alpha", "depth"}
     assert picture.deep is None
     assert picture.output.contributors is None
-    assert set(layers(take_picture(middle, still, RenderSettings(("rgba", "N"))))) >= {"normals"}
+    assert set(layers(render_picture(middle, still, RenderSettings(("rgba", "N"))))) >= {"normals"}

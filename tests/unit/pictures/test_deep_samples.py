@@ -7,12 +7,12 @@ import pytest
 import torch
 from scenes import layers, slab
 
+from dsar.geometry.camera_paths import CameraPath
 from dsar.geometry.cameras import look_at, project
-from dsar.geometry.paths import CameraPath
 from dsar.raster import rasterize
 from dsar_render.aovs import AOVS
 from dsar_render.deep import sample_deep
-from dsar_render.picture import RenderSettings, take_picture
+from dsar_render.picture import RenderSettings, render_picture
 
 
 @pytest.mark.parametrize("most", [1, 2, 4, 32])
@@ -73,8 +73,8 @@ def test_depths_never_fall_where_rounding_would_have_them_fall(middle, front):
 
 def test_a_picture_of_nothing_is_empty(middle, front, labels):
     away = dataclasses.replace(front, T_camera_world=look_at(np.array([0, 0, 5.0]), np.array([0, 0, 9.0])))
-    picture = take_picture(middle, CameraPath((away,)), RenderSettings(AOVS, deep=True), labels=labels)
-    assert not any(image.any() for name, image in layers(picture).items() if name != "heaviest")
-    assert (picture.output.heaviest == -1).all()
+    picture = render_picture(middle, CameraPath((away,)), RenderSettings(AOVS, deep=True), labels=labels)
+    assert not any(image.any() for name, image in layers(picture).items() if name != "largest_weight_id")
+    assert (picture.output.largest_weight_id == -1).all()
     assert not picture.deep.counts.any()
     assert len(picture.deep.alphas) == 0

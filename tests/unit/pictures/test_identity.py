@@ -7,7 +7,7 @@ import pytest
 import torch
 from scenes import layers
 
-from dsar.geometry.paths import CameraPath
+from dsar.geometry.camera_paths import CameraPath
 from dsar.geometry.rotations import (
     matrix_from_axis_angle,
     quaternion_from_axis_angle,
@@ -15,8 +15,8 @@ from dsar.geometry.rotations import (
 )
 from dsar.types import Camera, Gaussians
 from dsar_render.aovs import AOVS
-from dsar_render.instants import Instant
-from dsar_render.picture import RenderSettings, identify, take_picture
+from dsar_render.picture import RenderSettings, hash_job, render_picture
+from dsar_render.triplets import FrameTriplet
 
 PROVENANCE = {"checkpoint": "abc", "motion": "walk", "motion_hash": "12"}
 
@@ -29,7 +29,7 @@ def named(front: Camera, **changes) -> str:
         "provenance": PROVENANCE,
         "writer": "exr",
     }
-    return identify(**(arguments | changes))
+    return hash_job(**(arguments | changes))
 
 
 def test_a_job_is_the_same_however_it_is_told(front):
@@ -97,7 +97,7 @@ def test_a_picture_does_not_depend_on_the_number_of_threads(middle, moving, labe
     try:
         for threads in (1, numba.config.NUMBA_NUM_THREADS):
             numba.set_num_threads(threads)
-            pictures.append(take_picture(middle, moving, RenderSettings(AOVS, **settings), labels=labels))
+            pictures.append(render_picture(middle, moving, RenderSettings(AOVS, **settings), labels=labels))
     finally:
         numba.set_num_threads(before)
     one, many = map(layers, pictures)
@@ -109,7 +109,7 @@ def test_a_picture_does_not_depend_on_the_number_of_threads(middle, moving, labe
 
 def test_a_picture_does_not_change_what_it_is_made_of(middle, still, labels):
     before = [values.clone() for values in vars(middle.now).values()]
-    take_picture(middle, still, RenderSettings(AOVS, deep=True), labels=labels)
+    render_picture(middle, still, RenderSettings(AOVS, deep=True), labels=labels)
     assert all(map(torch.equal, before, vars(middle.now).values()))
 
 
@@ -130,16 +130,16 @@ def test_everything_follows_when_scene_and_camera_move_together(middle, moving, 
             camera, T_camera_world=(camera.T_camera_world.double() @ T_world_new).float()
         )
 
-    elsewhere = Instant(middle.frame, *map(carried, (middle.now, middle.before, middle.after)))
+    elsewhere = FrameTriplet(middle.frame, *map(carried, (middle.now, middle.before, middle.after)))
     path = dataclasses.replace(moving, cameras=tuple(map(followed, moving.cameras)))
-    here = take_picture(middle, moving, RenderSettings(AOVS), labels=labels)
-    there = take_picture(elsewhere, path, RenderSettings(AOVS), labels=labels)
+    here = render_picture(middle, moving, RenderSettings(AOVS), labels=labels)
+    there = render_picture(elsewhere, path, RenderSettings(AOVS), labels=labels)
     expected, found = layers(here), layers(there)
     hit = (here.output.alpha > 0.02) & (there.output.alpha > 0.02)
     expected["normals"] = expected["normals"] @ rotation.T
     expected["positions"] = expected["positions"] @ rotation.T + offset
     for name, image in expected.items():
-        if name == "heaviest":
+        if name == "largest_weight_id":
             # Of two equal shares rounding makes either the larger.
             assert (image == found[name])[hit].float().mean() > 0.999
             continue

@@ -8,14 +8,14 @@ from scenes import MIDDLE, joined, moved, slab
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
+from dsar.geometry.camera_paths import CameraPath
 from dsar.geometry.cameras import project
-from dsar.geometry.paths import CameraPath
 from dsar.geometry.rotations import (
     matrix_from_axis_angle,
 )
 from dsar.types import Gaussians, Picture
-from dsar_render.instants import Instant
-from dsar_render.picture import RenderSettings, take_picture
+from dsar_render.picture import RenderSettings, render_picture
+from dsar_render.triplets import FrameTriplet
 
 
 def premultiplied(picture: Picture) -> Tensor:
@@ -44,7 +44,7 @@ def decibels(one: Tensor, two: Tensor) -> float:
 def test_motion_vectors_lead_to_the_same_colours_in_the_frames_beside(instants, camera, request):
     path = request.getfixturevalue(camera)
     pictures = [
-        take_picture(instants[index], path, RenderSettings(("rgba", "motion")))
+        render_picture(instants[index], path, RenderSettings(("rgba", "motion")))
         for index in (MIDDLE - 1, MIDDLE, MIDDLE + 1)
     ]
     before, now, after = map(premultiplied, pictures)
@@ -70,7 +70,9 @@ def test_what_moves_parallel_to_the_image_moves_by_exactly_the_shift(front, stil
     flat = slab(front, middle.now, 3.0)
     right, down = front.T_camera_world[0, :3], front.T_camera_world[1, :3]
     after, before = moved(flat, 0.03 * right + 0.01 * down), moved(flat, 0.02 * right)
-    picture = take_picture(Instant(1002, flat, before, after), still, RenderSettings(("rgba", "motion")))
+    picture = render_picture(
+        FrameTriplet(1002, flat, before, after), still, RenderSettings(("rgba", "motion"))
+    )
     hit = picture.output.alpha > 0
     # fx = fy = 300 pixels at 3 m: a hundred pixels a metre.
     for found, shift in ((picture.aovs.forward, [3.0, 1.0]), (picture.aovs.backward, [2.0, 0.0])):
@@ -83,8 +85,8 @@ def test_a_camera_that_goes_with_the_figure_sees_no_motion(front, middle):
     transform = front.T_camera_world.clone()
     transform[:3, 3] -= transform[:3, :3] @ offset
     follows = CameraPath((front, dataclasses.replace(front, T_camera_world=transform)), (1002, 1003))
-    instant = Instant(1002, middle.now, after=moved(middle.now, offset))
-    picture = take_picture(instant, follows, RenderSettings(("motion",)))
+    triplet = FrameTriplet(1002, middle.now, after=moved(middle.now, offset))
+    picture = render_picture(triplet, follows, RenderSettings(("motion",)))
     assert picture.aovs.forward.abs().max() < 1e-3
 
 
@@ -93,9 +95,9 @@ def test_a_still_scene_moves_as_the_camera_does(front, middle):
     turn = torch.eye(4)
     turn[:3, :3] = matrix_from_axis_angle(torch.tensor([0.0, 0.02, 0.0]))
     turned = dataclasses.replace(front, T_camera_world=turn @ front.T_camera_world)
-    instant = Instant(1002, middle.now, after=middle.now)
+    triplet = FrameTriplet(1002, middle.now, after=middle.now)
     path = CameraPath((front, turned), (1002, 1003))
-    picture = take_picture(instant, path, RenderSettings(("rgba", "P", "motion")))
+    picture = render_picture(triplet, path, RenderSettings(("rgba", "P", "motion")))
     solid = picture.output.alpha > 0.99
     here, there = (project(camera, picture.aovs.positions[solid])[0] for camera in (front, turned))
     assert (picture.aovs.forward[solid] - (there - here)).abs().max() < 0.05
@@ -103,7 +105,7 @@ def test_a_still_scene_moves_as_the_camera_does(front, middle):
 
 def test_at_its_ends_a_motion_has_no_vectors(instants, still):
     first, last = (
-        take_picture(instants[index], still, RenderSettings(("motion",))).aovs for index in (0, -1)
+        render_picture(instants[index], still, RenderSettings(("motion",))).aovs for index in (0, -1)
     )
     assert not first.backward.any()
     assert first.forward.any()
@@ -123,9 +125,9 @@ def test_what_passes_the_cameras_plane_leaves_other_vectors_alone(front, still, 
         place = front.center + forward * depth + right * side
         return joined(middle.now, dataclasses.replace(one, means=place[None]))
 
-    instant = Instant(1002, with_one(depths[0], 0.9), None, with_one(depths[1], 1.0))
-    found = take_picture(instant, still, RenderSettings(("motion",))).aovs.forward
-    alone = Instant(1002, middle.now, None, middle.now)
-    assert not take_picture(alone, still, RenderSettings(("motion",))).aovs.forward.any()
+    triplet = FrameTriplet(1002, with_one(depths[0], 0.9), None, with_one(depths[1], 1.0))
+    found = render_picture(triplet, still, RenderSettings(("motion",))).aovs.forward
+    alone = FrameTriplet(1002, middle.now, None, middle.now)
+    assert not render_picture(alone, still, RenderSettings(("motion",))).aovs.forward.any()
     # At the faintest edges, whose sums are divided by an alpha of 1/255.
     assert found.abs().max() < 0.02

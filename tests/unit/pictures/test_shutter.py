@@ -12,12 +12,12 @@ from torch import Tensor
 
 from dsar.color import linear_from_srgb, srgb_from_linear
 from dsar.errors import ConfigError
-from dsar.geometry.paths import CameraPath
+from dsar.geometry.camera_paths import CameraPath
 from dsar.raster import rasterize
 from dsar.types import Gaussians
 from dsar_render.aovs import AOVS
-from dsar_render.instants import Instant
-from dsar_render.picture import RenderSettings, take_picture
+from dsar_render.picture import RenderSettings, render_picture
+from dsar_render.triplets import FrameTriplet
 
 
 def test_the_times_of_a_shutter_lie_evenly_within_it():
@@ -42,9 +42,9 @@ def test_neighbours_are_needed_for_motion_and_for_other_times(settings, needed):
 
 
 def test_an_open_shutter_does_not_change_a_still_figure(middle, still, labels, everything):
-    alike = Instant(middle.frame, middle.now, middle.now, middle.now)
+    alike = FrameTriplet(middle.frame, middle.now, middle.now, middle.now)
     settings = RenderSettings(AOVS, motion_samples=5, shutter=(-0.5, 0.5))
-    found, sharp = layers(take_picture(alike, still, settings, labels=labels)), layers(everything)
+    found, sharp = layers(render_picture(alike, still, settings, labels=labels)), layers(everything)
     for name in ("color", "alpha", *everything.aovs.coverage):
         torch.testing.assert_close(found[name], sharp[name], atol=2e-6, rtol=1e-5)
 
@@ -61,7 +61,7 @@ def light(color: Tensor, alpha: Tensor) -> np.ndarray:
 def test_alpha_and_light_are_means_of_the_moments_pictures(middle, camera, shutter, request):
     path = request.getfixturevalue(camera)
     settings = RenderSettings(("rgba",), motion_samples=3, shutter=shutter)
-    found = take_picture(middle, path, settings).output
+    found = render_picture(middle, path, settings).output
     moments = [rasterize(middle.at(time), path.at(middle.frame + time)) for time in settings.times]
     alpha = torch.stack([each.alpha.double() for each in moments]).mean(0)
     assert (found.alpha - alpha).abs().max() < 1e-6
@@ -82,7 +82,7 @@ def test_light_adds_up_not_what_a_display_makes_of_it(front):
     ]
     white, black = discs
     settings = RenderSettings(("rgba",), motion_samples=2, shutter=(-1.0, 1.0))
-    picture = take_picture(Instant(5, white, white, black), CameraPath((front,)), settings)
+    picture = render_picture(FrameTriplet(5, white, white, black), CameraPath((front,)), settings)
     color, alpha = picture.output.color, picture.output.alpha
     place = np.unravel_index(int(alpha.argmax()), alpha.shape)
     # Half a frame before it is white; half a frame later, halfway to black, sRGB .5 or a light of .214.
@@ -92,7 +92,7 @@ def test_light_adds_up_not_what_a_display_makes_of_it(front):
 
 def test_what_is_no_light_stays_sharp_under_an_open_shutter(middle, still, labels, everything):
     settings = RenderSettings(AOVS, motion_samples=2, shutter=(-0.25, 0.25))
-    found, sharp = layers(take_picture(middle, still, settings, labels=labels)), layers(everything)
+    found, sharp = layers(render_picture(middle, still, settings, labels=labels)), layers(everything)
     blurred = {"color", "alpha", *everything.aovs.coverage}
     for name in set(sharp) - blurred:
         assert torch.equal(found[name], sharp[name]), name
@@ -102,7 +102,7 @@ def test_what_is_no_light_stays_sharp_under_an_open_shutter(middle, still, label
 
 @pytest.mark.parametrize("settings", [{}, {"motion_samples": 3, "shutter": (-0.25, 0.25)}, {"overscan": 9}])
 def test_coverage_of_the_parts_sums_to_alpha(middle, still, labels, settings):
-    picture = take_picture(middle, still, RenderSettings(("rgba", "crypto"), **settings), labels=labels)
+    picture = render_picture(middle, still, RenderSettings(("rgba", "crypto"), **settings), labels=labels)
     shares = torch.stack(list(picture.aovs.coverage.values()))
     assert list(picture.aovs.coverage) == list(labels.names)
     assert (shares >= 0).all()
@@ -122,7 +122,7 @@ def test_coverage_is_the_share_of_the_parts_own_gaussians(everything, blended, l
 
 @pytest.mark.parametrize("overscan", [1, 16, 100])
 def test_overscan_adds_around_the_picture_and_leaves_it_as_it_is(middle, still, labels, everything, overscan):
-    wide = take_picture(middle, still, RenderSettings(AOVS, overscan=overscan), labels=labels)
+    wide = render_picture(middle, still, RenderSettings(AOVS, overscan=overscan), labels=labels)
     assert wide.camera == everything.camera
     assert wide.overscan == overscan
     inside = slice(overscan, -overscan)
@@ -140,8 +140,8 @@ def test_overscan_adds_around_the_picture_and_leaves_it_as_it_is(middle, still, 
 
 def test_overscan_shows_what_lies_beyond_the_picture(middle, front):
     close = CameraPath((dataclasses.replace(front.cropped(60, 60, 64, 64), name="close"),))
-    picture = take_picture(middle, close, RenderSettings(("rgba",), overscan=60))
-    whole = take_picture(middle, CameraPath((front,)), RenderSettings(("rgba",)))
+    picture = render_picture(middle, close, RenderSettings(("rgba",), overscan=60))
+    whole = render_picture(middle, CameraPath((front,)), RenderSettings(("rgba",)))
     torch.testing.assert_close(picture.output.alpha, whole.output.alpha[:184, :184], atol=1e-4, rtol=0)
 
 

@@ -1,0 +1,207 @@
+"""From residual maps to posed Gaussians in one compiled pass, forward and backward, on the CPU.
+
+The same function as sampling, `GaussianParameters.activate` and `pose_gaussians` one after another (the
+oracle of its tests), which as separate tensor operations cost more than rasterising the result.
+"""
+
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int32
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from dsar.avatar.posing import nearest_quaternions
+from dsar.avatar.template import SCALE_RANGE, GaussianParameters
+from dsar.geometry.harmonics import rotate_harmonics
+from dsar.raster.jit import kernel
+from dsar.types import Gaussians
+
+_SMALLEST, _LARGEST = map(np.float32, SCALE_RANGE)
+
+
+def bilinear_sampling(
+    rows: Tensor, columns: Tensor, upsample: int, size: tuple[int, int], square: int
+) -> tuple[Int32[Tensor, "n 4"], Float[Tensor, "n 4"]]:
+    """Return the four grid cells (flat) around each texel and their bilinear weights.
+
+    Charts end where they end: nothing is sampled from the other one. The body's is clamped on all sides; the
+    garment's, from texel row `square` on, is a tube, whose first column follows its last.
+
+    `rows` and `columns` count texels; a cell covers `upsample` x `upsample` of them.
+    """
+    tube, (height, width) = rows >= square, size
+    down, across = ((texel + 0.5) / upsample - 0.5 for texel in (rows, columns))
+    first = torch.where(tube, square // upsample, 0)
+    last = torch.where(tube, height, min(square // upsample, height)) - 1
+    down = torch.minimum(torch.maximum(down, first), last)
+    across = torch.where(tube, across, across.clamp(0, width - 1))
+    top, left = down.floor().long(), across.floor().long()
+    bottom, right = torch.minimum(top + 1, last), left + 1
+    down, across = down - top, across - left
+    left, right = (torch.where(tube, edge % width, edge.clamp_max(width - 1)) for edge in (left, right))
+    cells = torch.stack([y * width + x for y in (top, bottom) for x in (left, right)], -1)
+    weights = torch.stack([v * u for v in (1 - down, down) for u in (1 - across, across)], -1)
+    return cells.int(), weights.float()
+
+
+def sample_bilinear(
+    maps: Float[Tensor, "b c h w"], bilinear: tuple[Int32[Tensor, "n 4"], Float[Tensor, "n 4"]]
+) -> Float[Tensor, "b n c"]:
+    """Return map values at every texel, bilinear between the grid's cells."""
+    cells, weights = bilinear
+    return (maps.flatten(2).transpose(1, 2)[:, cells] * weights[:, :, None]).sum(2)
+
+
+def pose_fused(
+    template: GaussianParameters,
+    offset: Float[Tensor, "b 3 h w"],
+    appearance: Float[Tensor, "b a h w"],
+    bilinear: tuple[Int32[Tensor, "n 4"], Float[Tensor, "n 4"]],
+    axes: Float[Tensor, "n 3 3"],
+    blended: Float[Tensor, "b n 3 4"],
+) -> list[Gaussians]:
+    """Return the posed Gaussians of each batch entry; float32 in main memory only.
+
+    Args:
+        template: raw parameters that the residuals are added to.
+        offset: metres along each texel's `axes`.
+        appearance: residuals of raw values, as `GaussianParameters.activate` takes them.
+        bilinear: cells and weights of `bilinear_sampling`.
+        axes: columns are the offset's axes in the canonical frame.
+        blended: the linear blend of bone transforms at each texel.
+    """
+    values = torch.cat([offset, appearance], 1).flatten(2).transpose(1, 2)
+    bone_rotations = nearest_quaternions(blended[..., :3])
+    posed = []
+    for entry, bone_rotation, transform in zip(values, bone_rotations, blended, strict=True):
+        means, rotations, scales, opacities, harmonics = _Pose.apply(
+            entry, template.means, template.quaternions, template.log_scales, template.opacity_logits,
+            template.harmonics, *bilinear, axes, transform, bone_rotation,
+        )  # fmt: skip
+        if harmonics.shape[1] > 1:
+            harmonics = rotate_harmonics(harmonics[None], bone_rotation[None])[0]
+        posed.append(Gaussians(means, rotations, scales, opacities, harmonics))
+    return posed
+
+
+class _Pose(torch.autograd.Function):
+    """Values on the grid and raw parameters to posed Gaussians; the skeleton gets no gradient."""
+
+    @staticmethod
+    def forward(ctx: Any, *inputs: Tensor) -> tuple[Tensor, ...]:
+        arrays = [tensor.detach().contiguous().numpy() for tensor in inputs]
+        means, quaternions, log_scales, logits, harmonics = arrays[1:6]
+        outputs = [np.empty_like(a) for a in (means, quaternions, log_scales, logits, harmonics)]
+        _pose(*arrays, *outputs)
+        tensors = tuple(map(torch.from_numpy, outputs))
+        ctx.save_for_backward(*inputs, tensors[2], tensors[3])
+        return tensors
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        arrays = [tensor.detach().contiguous().numpy() for tensor in ctx.saved_tensors]
+        values, means, quaternions, log_scales, logits, harmonics, *rest = arrays
+        inputs = (values, means, quaternions, log_scales, logits, harmonics)
+        v_inputs = [np.zeros_like(values), *(np.empty_like(a) for a in inputs[1:])]
+        _pose_backward(values, quaternions, *rest, *(g.contiguous().numpy() for g in gradients), *v_inputs)
+        return *map(torch.from_numpy, v_inputs), None, None, None, None, None
+
+
+@kernel
+def _pose(
+    values, means, quaternions, log_scales, logits, harmonics, cells, weights, axes, transforms, bones,
+    out_means, out_rotations, out_scales, out_opacities, out_harmonics,
+):  # fmt: skip
+    """Sample the residuals of every texel, add them, activate, and pose."""
+    n, bands = harmonics.shape[0], harmonics.shape[1]
+    count = values.shape[1]
+    r = np.empty(count, np.float32)
+    for i in range(n):
+        i0, i1, i2, i3 = cells[i, 0], cells[i, 1], cells[i, 2], cells[i, 3]
+        w0, w1, w2, w3 = weights[i, 0], weights[i, 1], weights[i, 2], weights[i, 3]
+        for c in range(count):
+            r[c] = w0 * values[i0, c] + w1 * values[i1, c] + w2 * values[i2, c] + w3 * values[i3, c]
+        x = means[i, 0] + axes[i, 0, 0] * r[0] + axes[i, 0, 1] * r[1] + axes[i, 0, 2] * r[2]
+        y = means[i, 1] + axes[i, 1, 0] * r[0] + axes[i, 1, 1] * r[1] + axes[i, 1, 2] * r[2]
+        z = means[i, 2] + axes[i, 2, 0] * r[0] + axes[i, 2, 1] * r[1] + axes[i, 2, 2] * r[2]
+        t = transforms[i]
+        for k in range(3):
+            out_means[i, k] = t[k, 0] * x + t[k, 1] * y + t[k, 2] * z + t[k, 3]
+        bw, bx = quaternions[i, 0] + r[3], quaternions[i, 1] + r[4]
+        by, bz = quaternions[i, 2] + r[5], quaternions[i, 3] + r[6]
+        inverse = np.float32(1) / max(np.sqrt(bw * bw + bx * bx + by * by + bz * bz), np.float32(1e-12))
+        bw, bx, by, bz = bw * inverse, bx * inverse, by * inverse, bz * inverse
+        aw, ax, ay, az = bones[i, 0], bones[i, 1], bones[i, 2], bones[i, 3]
+        out_rotations[i, 0] = aw * bw - ax * bx - ay * by - az * bz
+        out_rotations[i, 1] = aw * bx + ax * bw + ay * bz - az * by
+        out_rotations[i, 2] = aw * by - ax * bz + ay * bw + az * bx
+        out_rotations[i, 3] = aw * bz + ax * by - ay * bx + az * bw
+        for k in range(3):
+            # Written so that NaN passes through: a value that is not finite must not look sound.
+            scale = np.exp(log_scales[i, k] + r[7 + k])
+            scale = _SMALLEST if scale < _SMALLEST else scale
+            out_scales[i, k] = _LARGEST if scale > _LARGEST else scale
+        out_opacities[i] = np.float32(1) / (np.float32(1) + np.exp(-(logits[i] + r[10])))
+        for b in range(bands):
+            for k in range(3):
+                out_harmonics[i, b, k] = harmonics[i, b, k] + r[11 + 3 * b + k]
+
+
+@kernel
+def _pose_backward(
+    values, quaternions, cells, weights, axes, transforms, bones, scales, opacities,
+    v_means, v_rotations, v_scales, v_opacities, v_harmonics,
+    out_values, out_means, out_quaternions, out_log_scales, out_logits, out_harmonics,
+):  # fmt: skip
+    """Bring gradients of posed Gaussians back to raw parameters, and add them up in the grid's cells."""
+    n, bands = v_harmonics.shape[0], v_harmonics.shape[1]
+    count = values.shape[1]
+    r = np.empty(count, np.float32)
+    for i in range(n):
+        i0, i1, i2, i3 = cells[i, 0], cells[i, 1], cells[i, 2], cells[i, 3]
+        w0, w1, w2, w3 = weights[i, 0], weights[i, 1], weights[i, 2], weights[i, 3]
+        t = transforms[i]
+        gx, gy, gz = v_means[i, 0], v_means[i, 1], v_means[i, 2]
+        x = t[0, 0] * gx + t[1, 0] * gy + t[2, 0] * gz
+        y = t[0, 1] * gx + t[1, 1] * gy + t[2, 1] * gz
+        z = t[0, 2] * gx + t[1, 2] * gy + t[2, 2] * gz
+        out_means[i, 0], out_means[i, 1], out_means[i, 2] = x, y, z
+        for k in range(3):
+            r[k] = axes[i, 0, k] * x + axes[i, 1, k] * y + axes[i, 2, k] * z
+        for c in range(3, 7):
+            r[c] = w0 * values[i0, c] + w1 * values[i1, c] + w2 * values[i2, c] + w3 * values[i3, c]
+        bw, bx = quaternions[i, 0] + r[3], quaternions[i, 1] + r[4]
+        by, bz = quaternions[i, 2] + r[5], quaternions[i, 3] + r[6]
+        inverse = np.float32(1) / max(np.sqrt(bw * bw + bx * bx + by * by + bz * bz), np.float32(1e-12))
+        bw, bx, by, bz = bw * inverse, bx * inverse, by * inverse, bz * inverse
+        # The gradient is rotated back with the conjugate of the bone's rotation.
+        aw, ax, ay, az = bones[i, 0], -bones[i, 1], -bones[i, 2], -bones[i, 3]
+        pw, px, py, pz = v_rotations[i, 0], v_rotations[i, 1], v_rotations[i, 2], v_rotations[i, 3]
+        qw = aw * pw - ax * px - ay * py - az * pz
+        qx = aw * px + ax * pw + ay * pz - az * py
+        qy = aw * py - ax * pz + ay * pw + az * px
+        qz = aw * pz + ax * py - ay * px + az * pw
+        radial = bw * qw + bx * qx + by * qy + bz * qz
+        r[3], r[4] = (qw - bw * radial) * inverse, (qx - bx * radial) * inverse
+        r[5], r[6] = (qy - by * radial) * inverse, (qz - bz * radial) * inverse
+        for k in range(3):
+            free = _SMALLEST < scales[i, k] < _LARGEST
+            r[7 + k] = v_scales[i, k] * scales[i, k] if free else np.float32(0)
+        r[10] = v_opacities[i] * opacities[i] * (np.float32(1) - opacities[i])
+        for b in range(bands):
+            for k in range(3):
+                r[11 + 3 * b + k] = v_harmonics[i, b, k]
+                out_harmonics[i, b, k] = v_harmonics[i, b, k]
+        for k in range(4):
+            out_quaternions[i, k] = r[3 + k]
+        for k in range(3):
+            out_log_scales[i, k] = r[7 + k]
+        out_logits[i] = r[10]
+        for c in range(count):
+            out_values[i0, c] += w0 * r[c]
+            out_values[i1, c] += w1 * r[c]
+            out_values[i2, c] += w2 * r[c]
+            out_values[i3, c] += w3 * r[c]

@@ -1,0 +1,1 @@
+"""Captures: one reader per format, all of which present a `MultiViewCapture`."""

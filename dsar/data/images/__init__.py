@@ -1,0 +1,1 @@
+"""Image files: decoded, checked and brought to sRGB with a mask of 8 bits."""

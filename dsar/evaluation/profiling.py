@@ -1,0 +1,90 @@
+"""The network's work taken apart: encoding, attention and decoding."""
+
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, TypeVar
+
+import torch
+from torch.utils.flop_counter import FlopCounterMode
+
+from dsar.network import DualStreamNetwork
+
+T = TypeVar("T")
+Interceptor = Callable[[str, Callable[[], Any]], Any]
+"""Is given a part's name and a call of it, and returns what the call returns."""
+
+
+@contextmanager
+def intercept_stages(network: DualStreamNetwork, interceptor: Interceptor) -> Iterator[None]:
+    """Have every call into the encoder (`encode`) and the decoder (`decode`) go through a watcher."""
+    encoder, decoder = network.encoder, network.decoder
+    calls = [
+        (encoder, "encode_frame", "encode"),
+        (encoder, "precompute", "encode"),
+        (encoder, "assemble_window", "encode"),
+    ]
+    calls += [(network, "embed_motion", "encode"), (decoder, "forward", "decode")]
+    for owner, name, part in calls:
+        method = getattr(owner, name)
+
+        def intercepted(*arguments: Any, method: Any = method, part: str = part) -> Any:
+            return interceptor(part, lambda: method(*arguments))
+
+        # On the object, where it hides the class's method.
+        owner.__dict__[name] = intercepted
+    try:
+        yield
+    finally:
+        for owner, name, _ in calls:
+            del owner.__dict__[name]
+
+
+def time_stages(network: DualStreamNetwork, step: Callable[[], T]) -> tuple[T, dict[str, float]]:
+    """Return what a step returns, and its milliseconds by part: `attention` is what the others are not."""
+    seconds: dict[str, float] = defaultdict(float)
+
+    def interceptor(part: str, call: Callable[[], Any]) -> Any:
+        start = read_clock()
+        result = call()
+        seconds[part] += read_clock() - start
+        return result
+
+    start = read_clock()
+    with intercept_stages(network, interceptor):
+        result = step()
+    total = read_clock() - start
+    return result, _with_attention(seconds, total, 1e3)
+
+
+def count_stage_flops(network: DualStreamNetwork, step: Callable[[], object]) -> dict[str, float]:
+    """Return the GFLOP of one step by part: convolutions and matrix products only, a multiply-add is two."""
+    flops: dict[str, float] = defaultdict(float)
+
+    def interceptor(part: str, call: Callable[[], Any]) -> Any:
+        with FlopCounterMode(display=False) as counter:
+            result = call()
+        flops[part] += counter.get_total_flops()
+        return result
+
+    with FlopCounterMode(display=False) as counter, intercept_stages(network, interceptor):
+        step()
+    return _with_attention(flops, counter.get_total_flops(), 1e-9)
+
+
+def read_clock() -> float:
+    """Return seconds, once the GPU has done what it was given."""
+    if torch.cuda.is_initialized():
+        torch.cuda.synchronize()
+    return time.perf_counter()
+
+
+def _with_attention(parts: dict[str, float], total: float, unit: float) -> dict[str, float]:
+    encode, decode = parts["encode"], parts["decode"]
+    return {
+        "encode": unit * encode,
+        "attention": unit * (total - encode - decode),
+        "decode": unit * decode,
+        "total": unit * total,
+    }

@@ -1,0 +1,64 @@
+"""The rollouts that a worker advances: which frame of which sequence each one sees next."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass
+class RolloutCursor:
+    """Where one rollout stands."""
+
+    sequence: str
+    """Name of the training sequence."""
+    frame: int
+    """Frame it will see next."""
+    age: int
+    """Frames it has seen since it was fresh."""
+    mirrored: bool = False
+    """Whether it sees the mirrored motion."""
+
+
+class RolloutBatch:
+    """A fixed number of rollouts over clips of frames [start, stop) of named sequences."""
+
+    def __init__(self, clips: Mapping[str, range], count: int, mirrored: float = 0.0) -> None:
+        self.clips, self.mirrored = dict(clips), mirrored
+        self.cursors: list[RolloutCursor | None] = [None] * count
+
+    def next_frames(
+        self, rng: np.random.Generator, max_rollout_frames: int
+    ) -> tuple[list[RolloutCursor], list[bool]]:
+        """Return where each rollout stands, and which of them start afresh with this frame.
+
+        A rollout restarts at the end of its clip or after `max_rollout_frames`: in the middle of a
+        clip while those are few, at a clip's first frame (where cloth is at rest) once they are not. The
+        first start of all is anywhere, or rollouts of whole clips would march in step.
+        """
+        fresh = []
+        for index, cursor in enumerate(self.cursors):
+            over = (
+                cursor is None
+                or cursor.frame >= self.clips[cursor.sequence].stop
+                or cursor.age >= max_rollout_frames
+            )
+            if over:
+                self.cursors[index] = self._restart(rng, max_rollout_frames, anywhere=cursor is None)
+            fresh.append(over)
+        return [cursor for cursor in self.cursors if cursor is not None], fresh
+
+    def advance(self) -> None:
+        """Move every rollout one frame on."""
+        for cursor in self.cursors:
+            if cursor is not None:
+                cursor.frame, cursor.age = cursor.frame + 1, cursor.age + 1
+
+    def _restart(self, rng: np.random.Generator, max_rollout_frames: int, *, anywhere: bool) -> RolloutCursor:
+        names = list(self.clips)
+        lengths = np.array([len(self.clips[name]) for name in names], float)
+        name = names[rng.choice(len(names), p=lengths / lengths.sum())]
+        clip = self.clips[name]
+        latest = clip.stop - (1 if anywhere else max_rollout_frames)
+        start = int(rng.integers(clip.start, latest + 1)) if latest > clip.start else clip.start
+        return RolloutCursor(name, start, 0, bool(rng.random() < self.mirrored))
