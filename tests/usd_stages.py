@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from pxr import Gf, Usd, UsdGeom
 
-from dsar.geometry.cameras import project
 from dsar.geometry.camera_paths import CameraPath
+from dsar.geometry.cameras import project
 from dsar.types import Camera
 from dsar_exporters import read_usd_cameras
 

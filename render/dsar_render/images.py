@@ -83,13 +83,8 @@ def write_png(output: RenderOutput, path: Path, *, job_hash: str = "") -> Path:
     color, alpha = output.color.detach().cpu().numpy(), output.alpha.detach().cpu().numpy()
     coverage = alpha[..., None]
     straight = np.divide(color, coverage, out=np.zeros_like(color), where=coverage >= _MIN_ALPHA)
-<<<<<<< HEAD
-    with atomic_write(path) as draft:
-        Image.fromarray(_quantized(np.concatenate([straight, coverage], -1))).save(
-=======
     with atomic_write(path) as draft:
         Image.fromarray(_to_uint8(np.concatenate([straight, coverage], -1))).save(
->>>>>>> ea6c81e (EXR: camera attributes, parts and windows in files of their own; renderer's frames have neighbours, not instants)
             draft, format="PNG", pnginfo=text
         )
     return path

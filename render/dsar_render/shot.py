@@ -11,15 +11,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import UInt8
 
-<<<<<<< HEAD
-from dsar.errors import ConfigError
-from dsar.geometry.camera_paths import CameraPath
-from dsar.types import Camera, GaussianSequence, Picture
-=======
 from dsar.geometry.camera_paths import CameraPath
 from dsar.types import GaussianSequence
 from dsar_render.camera_names import check_camera_names
->>>>>>> ea6c81e (EXR: camera attributes, parts and windows in files of their own; renderer's frames have neighbours, not instants)
 from dsar_render.farm import run_tasks
 from dsar_render.images import crop_overscan, display_image, over
 from dsar_render.labels import Labels, label_sequence
