@@ -1,4 +1,4 @@
-"""Each equation of the paper is found by its number, in one docstring: that of the code that implements it."""
+"""Each equation of the paper is found by its number, in one docstring: of the code that implements it."""
 
 import ast
 import re
