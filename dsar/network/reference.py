@@ -1,4 +1,4 @@
-"""Equations 4 to 16 of the paper (section 3.4) as they stand there: no cache, no variants, nothing fused.
+"""The paper's dual-stream architecture (section 3.4) as its text reads: no cache, no variants, nothing fused.
 
 It defines what `dsar.network` must compute, for training's step and the inference session alike, and reads
 from top to bottom beside the paper. Every frame of the window is encoded at every step, all rows of the
