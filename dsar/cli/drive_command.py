@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 from dsar.cli.command import RunCommand, resolve_sequence
 from dsar.errors import ConfigError, DsarError
+from dsar.geometry.frame_numbers import parse_frames
 from dsar.geometry.frame_rates import exact_rate, parse_rate, same_rate
 from dsar.types import Body, Camera, GaussianSequence, Motion
 
@@ -64,8 +65,6 @@ class DriveCommand(RunCommand):
 
     def requested_frames(self) -> list[int] | None:
         """Return the frames that are asked for, None for all."""
-        from dsar_exporters import parse_frames
-
         return None if self.frames is None else parse_frames(self.frames)
 
     def check_name(self, name: str) -> None:

@@ -1,4 +1,4 @@
-"""How far a motion's poses are from those of training (paper equation 24)."""
+"""How far a motion's poses are from those of training."""
 
 from collections.abc import Mapping, Sequence
 
@@ -28,9 +28,9 @@ def median_distance(features: Float[Tensor, "n d"]) -> float:
 
 
 def mmd(x: Float[Tensor, "n d"], y: Float[Tensor, "m d"], bandwidth: float) -> float:
-    """Return the maximum mean discrepancy of two samples of at least two poses each.
+    """Return the maximum mean discrepancy of two samples of at least two poses each (paper equation 24).
 
-    The root of the unbiased estimate of MMD² (Gretton et al. 2012, equation 3) with the kernel
+    The root of the unbiased estimate of MMD² of Gretton et al. (2012) with the kernel
     exp(-d² / (2 bandwidth²)); 0 where that estimate is below zero. The paper gives no features, bandwidth or
     estimator: its limits of near (0.3) and far (0.6) need not fit these.
     """

@@ -9,12 +9,12 @@ import torch
 from any_camera import random_camera
 
 from dsar.errors import ConfigError
+from dsar.geometry.camera_faults import PROJECTION_FAULTS, explain_projection
 from dsar.geometry.cameras import project
 from dsar_exporters import read_back_projections, write_usd
 from dsar_exporters.projections import _speck as speck
 from dsar_exporters.usd import read_usd_projections
 from dsar_render.crosscheck.comparison import TOLERANCE_PX, find_fault, seed_mistakes
-from dsar_render.crosscheck.mistakes import MISTAKES, name_mistake
 from dsar_render.crosscheck.points import (
     Residuals,
     SphereObservations,
@@ -42,7 +42,7 @@ def test_a_large_camera_agrees_as_well_though_it_is_looked_through_at_1024_pixel
     large = oblong.resized(32 * oblong.width, 24 * oblong.height)
     observations = project_spheres(scalar, large)
     assert Residuals.from_distances(observations.residuals(camera_projection(large))).rms < 0.05
-    shifted = MISTAKES[0].variants[0](large)
+    shifted = PROJECTION_FAULTS[0].changes[0](large)
     assert find_fault(large, observations, camera_projection(large)) is None
     assert find_fault(large, observations, camera_projection(shifted)) == "half_pixel_shift"
 
@@ -71,14 +71,14 @@ def test_seeded_mistakes_are_caught_and_named(scalar, oblong):
     assert found == {name: name for name in found}
 
 
-@pytest.mark.parametrize("mistake", MISTAKES, ids=lambda mistake: mistake.name)
+@pytest.mark.parametrize("mistake", PROJECTION_FAULTS, ids=lambda mistake: mistake.name)
 def test_every_way_to_make_a_mistake_has_its_name(mistake):
     for seed in range(5):
         camera = random_camera(seed)
         points, _ = place_spheres(camera, seed)
-        for make in mistake.variants:
+        for make in mistake.changes:
             places, _ = project(make(camera), points)
-            found = name_mistake(camera, points, places, TOLERANCE_PX)
+            found = explain_projection(camera, points, places, TOLERANCE_PX)
             assert found is not None
             assert found.name == mistake.name
 
@@ -143,7 +143,7 @@ def test_what_is_no_usual_mistake_is_unknown(scalar, oblong):
 
 
 def test_a_mistake_in_what_mitsuba_was_told_is_named_too(scalar, oblong):
-    shifted = MISTAKES[0].variants[0](oblong)
+    shifted = PROJECTION_FAULTS[0].changes[0](oblong)
     observations = project_spheres(scalar, shifted)
     assert find_fault(oblong, observations, camera_projection(oblong)) == "half_pixel_shift"
 
