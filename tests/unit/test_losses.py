@@ -10,13 +10,12 @@ from dsar.metrics.images import ssim
 from dsar.network import NetworkOutput
 from dsar.training.fused_loss import fused_image_loss
 from dsar.training.losses import (
-    TemporalRecord,
     plain_image_loss,
     pyramid_l1,
     registered_loss,
     spatial_loss,
-    temporal_losses,
 )
+from dsar.training.temporal_losses import TemporalRecord, temporal_losses
 
 
 def images(seed=0, size=(40, 33)):
