@@ -15,6 +15,9 @@ OLDEST_VERSION = 3
 AVATAR_NAMES = {
     "cells": "control_cells",
     "speed_scale": "magnitude_scale",
+    "pose_mean": "principal_poses.mean",
+    "pose_basis": "principal_poses.basis",
+    "pose_deviation": "principal_poses.deviation",
     "network.attention.age": "network.attention.position_embedding",
     "network.bank.attention.age": "network.bank.attention.position_embedding",
     "network.bank.recall_logit": "network.bank.memory_logit",
