@@ -107,10 +107,10 @@ class ChunkTrainer:
     def backward_chunk(
         self, rng: np.random.Generator, now: ScheduleState, *, probe: bool = False
     ) -> UpdateMetrics:
-        """Step every rollout by K frames and back-propagate L_total through them, the whole body shown.
+        """Step every rollout by K frames and back-propagate L_total (paper equation 22).
 
-        L_total is paper equation 22, with regularisers of space and to registered maps besides. With
-        `probe`, report how the gradients of the losses compare.
+        The whole body is shown. L_total has losses over space and to registered maps besides. With `probe`,
+        report how the gradients of the losses compare.
         """
         self.avatar.unhide_covered_texels()
         schedule = self.config.schedule

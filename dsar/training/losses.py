@@ -51,9 +51,9 @@ def image_loss(
     config: LossConfig,
     lpips: torch.nn.Module | None,
 ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
-    """Return L_render of one view over a background, and its mean squared error for reporting.
+    """Return L_render of one view over a background (paper equation 23), and its mean squared error.
 
-    It is paper equation 23, with L_rgb over a pyramid, and the difference of alpha and mask besides.
+    L_rgb is taken over a pyramid, and the difference of alpha and mask is added.
     """
     truth = target.color + (1 - target.alpha[..., None]) * background
     on_cpu = truth.dtype == torch.float32 and truth.device.type == "cpu"
