@@ -18,7 +18,7 @@ class Mistake:
 
     name: str
     """A word for it, stable."""
-    what: str
+    description: str
     """The same for people."""
     variants: tuple[Callable[[Camera], Camera], ...]
     """The ways to make it, each from a right camera."""
@@ -35,14 +35,14 @@ def name_mistake(
         pixels: Where the questionable camera has them; those that are not finite are left out.
         tolerance: Root mean square of the pixels that are still explained.
     """
-    there = pixels.isfinite().all(-1)
-    if there.sum() < 4:
+    finite = pixels.isfinite().all(-1)
+    if finite.sum() < 4:
         return None
     best: tuple[float, Mistake] | None = None
     for mistake in MISTAKES:
-        for make in mistake.variants:
-            places, _ = project(make(camera), points[there])
-            error = float((places - pixels[there]).square().sum(-1).mean().sqrt())
+        for variant in mistake.variants:
+            places, _ = project(variant(camera), points[finite])
+            error = float((places - pixels[finite]).square().sum(-1).mean().sqrt())
             if error <= tolerance and (best is None or error < best[0]):
                 best = error, mistake
     return best[1] if best else None

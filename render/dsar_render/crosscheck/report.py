@@ -20,7 +20,8 @@ def write_crosscheck_report(verdict: Verdict, path: Path) -> Path:
     source = Path(__file__).with_name("report.html.jinja").read_text(encoding="utf-8")
     facts = {
         "verdict": verdict,
-        "what": {each.name: each.what for each in MISTAKES} | {"unknown": "none of the usual mistakes"},
+        "descriptions": {mistake.name: mistake.description for mistake in MISTAKES}
+        | {"unknown": "none of the usual mistakes"},
         "steps": STEPS,
         "pictures": {name: [_embedded(image) for image in row] for name, row in verdict.pictures.items()},
     }
