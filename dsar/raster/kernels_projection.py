@@ -86,15 +86,15 @@ def _project(scratch, camera, width, height):
     mean_y = camera[13] * point[1] / point[2] + camera[15]
     log_opacity = log2(opacity)
     # Alpha is at least ALPHA_MIN within this many variances, squared, of the mean.
-    reach = (_TWO * _LN2) * (log_opacity - _LOG_ALPHA_MIN) + np.float32(1e-4)
-    x0, x1 = _pixel_range(mean_x, sqrt(reach * a), width)
-    y0, y1 = _pixel_range(mean_y, sqrt(reach * c), height)
+    cutoff = (_TWO * _LN2) * (log_opacity - _LOG_ALPHA_MIN) + np.float32(1e-4)
+    x0, x1 = _pixel_range(mean_x, sqrt(cutoff * a), width)
+    y0, y1 = _pixel_range(mean_y, sqrt(cutoff * c), height)
     # Comparisons with NaN fail, and so does one with an infinite or NaN sum.
     finite = mean_x + mean_y + point[2] + a + c + schur + opacity
-    sound = (finite <= _FLOAT_MAX) & (finite >= -_FLOAT_MAX)
+    valid = (finite <= _FLOAT_MAX) & (finite >= -_FLOAT_MAX)
     # A quaternion whose square overflows has no inverse norm.
-    sound = sound & (inverse > _ZERO) & (minimum(minimum(scales[0], scales[1]), scales[2]) > _ZERO)
-    drawn = sound & (point[2] > _NEAR) & (opacity >= _ALPHA_MIN) & (x0 < x1) & (y0 < y1)
+    valid = valid & (inverse > _ZERO) & (minimum(minimum(scales[0], scales[1]), scales[2]) > _ZERO)
+    drawn = valid & (point[2] > _NEAR) & (opacity >= _ALPHA_MIN) & (x0 < x1) & (y0 < y1)
     stretch = sqrt(_HALF * _LOG2_E / schur)
     write_plane(scratch, 0, mean_x)
     write_plane(scratch, 1, mean_y)
@@ -103,8 +103,8 @@ def _project(scratch, camera, width, height):
     write_plane(scratch, 4, sqrt(_HALF * _LOG2_E / c))
     write_plane(scratch, 5, log_opacity)
     write_plane(scratch, 9, point[2])
-    write_plane(scratch, 10, sqrt(reach * c))
-    write_plane(scratch, 11, b * sqrt(reach / a))
+    write_plane(scratch, 10, sqrt(cutoff * c))
+    write_plane(scratch, 11, b * sqrt(cutoff / a))
     nothing = broadcast(_ZERO)
     write_plane(scratch, BOUNDS, select(drawn, x0, nothing))
     write_plane(scratch, BOUNDS + 1, select(drawn, x1, nothing))
