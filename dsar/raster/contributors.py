@@ -22,7 +22,7 @@ def find_first_hit_depth(contributors: Contributors, depths: Float[Tensor, " n"]
 
 
 def find_largest_weight_id(contributors: Contributors) -> Int[Tensor, "h w"]:
-    """Return the Gaussian with each pixel's largest weight, the foremost of equals, -1 where there is none."""
+    """Return the Gaussian of each pixel's largest weight, the foremost of equals, -1 where there is none."""
     counts = contributors.counts.flatten()
     pixels = torch.arange(len(counts), device=counts.device).repeat_interleave(counts)
     weights = contributors.weights

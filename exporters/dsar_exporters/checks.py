@@ -111,8 +111,8 @@ def _check_finite(frame: int, gaussians: Gaussians, last_finite: int | None) -> 
     cause = (
         "the checkpoint or the motion holds such values, or the network made them at once: look at both"
         if last_finite is None
-        else f"frame {last_finite} is finite: the motion holds such values there, or the network made them on "
-        f"the way: look at the motion, or export frames up to {last_finite}"
+        else f"frame {last_finite} is finite: the motion holds such values there, or the network made them "
+        f"on the way: look at the motion, or export frames up to {last_finite}"
     )
     raise ExportError(f"frame {frame}: expected finite {'; finite '.join(faults)}: {cause}")
 
