@@ -170,7 +170,7 @@ class _CameraReader:
         aspects = [aperture] if own is None else [aperture, own[0] / own[1]]
         return any(abs(aspect / picture - 1) <= _FITS for aspect in aspects)
 
-    def _noted(self) -> tuple[int, int] | None:
+    def _noted_resolution(self) -> tuple[int, int] | None:
         """Return the resolution that `define_camera` noted."""
         resolution = self._prim.GetCustomDataByKey("dsar:resolution")
         return None if resolution is None else (int(resolution[0]), int(resolution[1]))
