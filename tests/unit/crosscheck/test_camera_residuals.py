@@ -11,7 +11,7 @@ from any_camera import random_camera
 from dsar.errors import ConfigError
 from dsar.geometry.cameras import project
 from dsar_exporters import read_back_projections, write_usd
-from dsar_exporters.projections import _speck as speck
+from dsar_exporters.projections import _single_gaussian as speck
 from dsar_exporters.usd import read_usd_projections
 from dsar_render.crosscheck.comparison import TOLERANCE_PX, find_mistake, seed_mistakes
 from dsar_render.crosscheck.mistakes import MISTAKES, name_mistake
