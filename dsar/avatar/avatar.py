@@ -19,12 +19,11 @@ from dsar.body.model import PARENTS
 from dsar.body.skinning import forward_kinematics
 from dsar.config import AtlasConfig, ModelConfig
 from dsar.geometry.rotations import heading_matrix
-from dsar.network import STREAMS, DualStreamNetwork, NetworkOutput, NetworkState, Stream
+from dsar.network import STREAMS, NetworkOutput, NetworkState, Stream, build_network
+from dsar.network.variants.principal_poses import PrincipalPoses
 from dsar.types import Body, Capture, Gaussians, Motion
 
 _log = logging.getLogger(__name__)
-_POSE_LIMIT = 2.0
-"""Standard deviations of a principal component that a pose may be away from the mean of training."""
 GARMENT_FRAMES = 12
 """Still frames whose masks shape the garment chart."""
 
@@ -49,9 +48,6 @@ class Avatar(nn.Module):
     map_mean: Tensor
     map_scale: Tensor
     magnitude_scale: Tensor
-    pose_mean: Tensor
-    pose_basis: Tensor
-    pose_deviation: Tensor
     surface_edges: Tensor
     body_joints: Tensor
     bilinear_indices: Tensor
@@ -94,13 +90,11 @@ class Avatar(nn.Module):
         self.register_buffer("map_mean", torch.zeros(model.map_channels, 1, 1))
         self.register_buffer("map_scale", torch.ones(model.map_channels, 1, 1))
         self.register_buffer("magnitude_scale", torch.ones(()))
-        self.register_buffer("pose_mean", torch.zeros(3 * len(cells)))
-        self.register_buffer("pose_basis", torch.zeros(model.pose_components, 3 * len(cells)))
-        self.register_buffer("pose_deviation", torch.zeros(model.pose_components))
+        self.principal_poses = PrincipalPoses(model.pose_components, len(cells))
         occupied = torch.zeros(size[0] * size[1], dtype=torch.bool)
         occupied[cells] = True
         self.template = GaussianParameters(atlas.positions, atlas.tangents, atlas.hidden, model.sh_degree)
-        self.network = DualStreamNetwork(model, occupied.reshape(size))
+        self.network = build_network(model, occupied.reshape(size))
 
     @classmethod
     def from_capture(cls, capture: Capture, body: Body, atlas: AtlasConfig, model: ModelConfig) -> "Avatar":
@@ -193,13 +187,7 @@ class Avatar(nn.Module):
         deviation = (values - self.map_mean[:, 0]).square().mean((0, 2)).sqrt()
         self.map_scale.copy_(deviation.clamp_min(1e-3)[:, None, None])
         self.magnitude_scale.copy_(torch.cat(magnitudes).square().mean().sqrt().clamp_min(1e-3))
-        if self.model.pose_components:
-            positions = values[:, :3].flatten(1)
-            self.pose_mean.copy_(positions.mean(0))
-            _, singular_values, basis = torch.linalg.svd(positions - self.pose_mean, full_matrices=False)
-            count = min(len(singular_values), self.model.pose_components)
-            self.pose_basis[:count] = basis[:count]
-            self.pose_deviation[:count] = singular_values[:count] / len(positions) ** 0.5
+        self.principal_poses.fit(values[:, :3])
 
     def garment_control_points(self) -> Int64[Tensor, " g"]:
         """Return which control points lie on the garment's chart; none where there is no such chart."""
@@ -246,19 +234,9 @@ class Avatar(nn.Module):
 
     def standardize(self, input_maps: InputMaps) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 1 h w"]]:
         """Return input maps and motion magnitude as the network takes them."""
-        maps = input_maps.maps
-        if self.model.pose_components and not self.training:
-            maps = torch.cat([self.project_onto_training_poses(maps[:, :3]), maps[:, 3:]], 1)
+        maps = self.principal_poses(input_maps.maps, self.control_cells)
         maps = (maps - self.map_mean) / self.map_scale * self.network.occupied
         return maps, input_maps.magnitude / self.magnitude_scale
-
-    def project_onto_training_poses(self, position: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
-        """Return the nearest position maps that the principal components of the training poses allow."""
-        flat = position.flatten(2)
-        coefficients = (flat[:, :, self.control_cells].flatten(1) - self.pose_mean) @ self.pose_basis.mT
-        bound = _POSE_LIMIT * self.pose_deviation
-        points = self.pose_mean + torch.clamp(coefficients, -bound, bound) @ self.pose_basis
-        return flat.index_copy(2, self.control_cells, points.unflatten(1, (3, -1))).view_as(position)
 
     def forward_frame(
         self,

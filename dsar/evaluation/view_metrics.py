@@ -15,14 +15,13 @@ from dsar.avatar.avatar import Avatar
 from dsar.avatar.rollout import START_FRAME, roll_out
 from dsar.data.captures.multiview import MultiViewCapture
 from dsar.evaluation.garment_metrics import garment_mask
-from dsar.evaluation.image_metrics import ImageMetric, psnr
+from dsar.evaluation.image_metrics import ImageMetric
 from dsar.evaluation.results import ViewMetrics
 from dsar.evaluation.temporal_metrics import temporal_psnr, trace_back, warp_error
 from dsar.evaluation.views import WHITE, View, render_white, true_view
+from dsar.metrics.images import mask_box, psnr, ssim
 from dsar.network import STREAMS, Stream
 from dsar.raster import rasterize
-from dsar.training.losses import ssim
-from dsar.training.targets import mask_box
 from dsar.types import Camera, Capture, Gaussians
 
 _SLOW_EVERY = 4

@@ -86,12 +86,13 @@ def test_unfamiliar_poses_become_familiar_ones_once_trained():
         .maps[:, :3]
         .flatten(2)[:, :, avatar.control_cells]
     )
-    far = ((parts.flatten(1) - avatar.pose_mean) @ avatar.pose_basis.mT).abs() / avatar.pose_deviation
+    poses = avatar.principal_poses
+    far = ((parts.flatten(1) - poses.mean) @ poses.basis.mT).abs() / poses.deviation
     assert far.max() > 2
     points = (
         tame[:, :3].flatten(2)[:, :, avatar.control_cells] * avatar.map_scale[:3, 0] + avatar.map_mean[:3, 0]
     )
-    found = ((points.flatten(1) - avatar.pose_mean) @ avatar.pose_basis.mT).abs() / avatar.pose_deviation
+    found = ((points.flatten(1) - poses.mean) @ poses.basis.mT).abs() / poses.deviation
     assert found.max() < 2.01
     assert not torch.allclose(tame[:, :3], wild[:, :3], atol=0.1)
 
