@@ -100,12 +100,12 @@ def seed_mistakes(mi: Any, camera: Camera) -> dict[str, str | None]:
     probe = Camera(K, _rolled(T, 0.2), width, height, "probe")
     observations = project_spheres(mi, probe)
     return {
-        each.name: find_mistake(probe, observations, camera_projection(each.changes[0](probe)))
+        each.name: find_fault(probe, observations, camera_projection(each.changes[0](probe)))
         for each in PROJECTION_FAULTS
     }
 
 
-def find_mistake(camera: Camera, observations: SphereObservations, source: Projection) -> str | None:
+def find_fault(camera: Camera, observations: SphereObservations, source: Projection) -> str | None:
     """Return the mistake that a projection has made, `unknown` if it is none of the usual; None if none.
 
     Args:
@@ -128,7 +128,7 @@ def _judge(
     residuals = {
         name: Residuals.from_distances(observations.residuals(source)) for name, source in sources.items()
     }
-    faults = {name: find_mistake(camera, observations, source) for name, source in sources.items()}
+    faults = {name: find_fault(camera, observations, source) for name, source in sources.items()}
     named = {name: fault for name, fault in faults.items() if fault is not None}
     return CameraVerdict(camera.name, residuals, named, proxy)
 
