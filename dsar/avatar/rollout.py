@@ -68,8 +68,9 @@ def roll_out(
         )
     numbers = sorted(set(numbers))
     wanted = [number - START_FRAME for number in numbers]
-    times = locate_frames(avatar.body, motion, delivered)
-    poses = delivery_transforms(avatar.body, motion, delivered, times)[wanted]
+    signal = avatar.driving_signal(motion)
+    times = locate_frames(signal, delivered)
+    poses = delivery_transforms(avatar.body, signal, delivered, times)[wanted]
     times = [times[frame] for frame in wanted]
     return GaussianSequence(
         frame_numbers=numbers,
@@ -83,10 +84,10 @@ def roll_out(
 
 def _bind(avatar: Avatar, poses: Float[Tensor, "f j 4 4"]) -> Binding:
     """Return how the avatar hangs on its body where that carries it (T_world_rest of its joints)."""
-    width = avatar.atlas_size[1]
+    width, height = avatar.atlas_size[1], len(avatar.charts[0].rows)
     rows, columns = avatar.texels // width, avatar.texels % width
-    # The body's chart is a square; charts of garments lie below it.
-    uv = torch.stack([(columns + 0.5) / width, 1 - (rows + 0.5) / width], -1)
+    # The body's chart fills its texture; charts of garments lie below it.
+    uv = torch.stack([(columns + 0.5) / width, 1 - (rows + 0.5) / height], -1)
     # Writers work on the CPU, whatever the avatar does.
     return Binding(
         body=avatar.body.to(device="cpu"),
@@ -105,7 +106,7 @@ def template_sequence(sequence: GaussianSequence, avatar: Avatar, motion: Motion
     @torch.no_grad()
     def produce() -> Iterator[Gaussians]:
         for number in sequence.frame_numbers:
-            yield avatar.gaussians(signal[[number - START_FRAME]], None)[0]
+            yield avatar.gaussians(signal.windows[[number - START_FRAME]], None)[0]
 
     return dataclasses.replace(sequence, produce=produce)
 
@@ -118,10 +119,10 @@ def network_outputs(
     On a GPU an output lasts until the next is asked for.
     """
     signal = avatar.driving_signal(motion)
-    session = InferenceSession(avatar.network, streams, torch.bfloat16 if signal.is_cuda else None)
+    session = InferenceSession(avatar.network, streams, torch.bfloat16 if signal.windows.is_cuda else None)
     for frame in range(len(signal)):
         with torch.no_grad():
-            motion_window = signal[[frame]]
+            motion_window = signal.windows[[frame]]
             output = session.step(*avatar.standardize(avatar.input_maps(motion_window, avatar.fps)))
         yield motion_window, output
 

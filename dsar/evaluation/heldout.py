@@ -73,7 +73,7 @@ def evaluate_sequence(
     for number, gaussians in roll_out(avatar, motion, streams=streams):
         frame = number - START_FRAME
         if frame % stride == 0:
-            template = avatar.gaussians(signal[[frame]], None)[0]
+            template = avatar.gaussians(signal.windows[[frame]], None)[0]
             for index in capture.cameras_with_image(sequence, frame):
                 camera, truth = capture.cameras[index], true_view(capture, sequence, frame, index)
                 image = render_white(gaussians, camera)
@@ -185,7 +185,7 @@ def time_rollout(
     times: dict[str, list[float]] = defaultdict(list)
     for frame in range(_WARM_UP + frames):
         start = read_clock()
-        motion_window = signal[[frame % len(signal)]]
+        motion_window = signal.windows[[frame % len(signal)]]
         maps, magnitude = avatar.standardize(avatar.input_maps(motion_window, avatar.fps))
         seen = read_clock()
         step = partial(session.step, maps, magnitude)

@@ -31,7 +31,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from dsar.avatar.avatar import Avatar
-from dsar.body.atlas import Atlas
+from dsar.avatar.charts import Atlas, decode_charts, encode_charts
 from dsar.body.model import PARENTS
 from dsar.config import EMBEDDED, TrainConfig, config_from_json
 from dsar.errors import CheckpointError, ConfigError
@@ -233,7 +233,8 @@ def _avatar(tensors: dict[str, Tensor], config: TrainConfig, path: Path) -> Avat
     body = Body(parents=PARENTS, **{name: tensors[f"body_{name}"] for name in _BODY})
     height, width = (int(size) for size in tensors.pop("atlas_size"))
     fields = ("positions", "weights", "frames", "tangents", "hidden")
-    atlas = Atlas(height, width, tensors["texels"], *(tensors[f"texel_{name}"] for name in fields))
+    charts = decode_charts(tensors.pop("charts", None), height, width)
+    atlas = Atlas(charts, width, tensors["texels"], *(tensors[f"texel_{name}"] for name in fields))
     avatar = Avatar(body, atlas, config.model, float(tensors.pop("fps")))
     expected = {name: tuple(value.shape) for name, value in avatar.state_dict().items()}
     found = {name: tuple(value.shape) for name, value in tensors.items()}
@@ -251,6 +252,7 @@ def save_avatar(avatar: Avatar, folder: Path) -> None:
     """Write the avatar's parameters and everything needed to rebuild it."""
     tensors = {name: value.detach().contiguous() for name, value in avatar.state_dict().items()}
     tensors["atlas_size"] = torch.tensor(avatar.atlas_size)
+    tensors["charts"] = encode_charts(avatar.charts)
     tensors["fps"] = torch.tensor(avatar.fps, dtype=torch.float64)
     save_file(tensors, folder / "avatar.safetensors")
 

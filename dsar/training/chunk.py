@@ -78,11 +78,7 @@ class ChunkTrainer:
         self.rollouts = RolloutBatch(
             clips, config.schedule.rollouts_per_worker, config.schedule.mirrored_fraction
         )
-        self.mirror = (
-            Mirror(avatar.control_points, avatar.control_axes, avatar.control_cells)
-            if config.schedule.mirrored_fraction
-            else None
-        )
+        self.mirror = Mirror(avatar.control) if config.schedule.mirrored_fraction else None
         self.state: NetworkState = avatar.initial_state(config.schedule.rollouts_per_worker)
         self.registered: Mapping[str, tuple[Collection[int], Tensor]] = {}
         """Frames that have a registered map, and the maps at the control points, by sequence."""
@@ -99,7 +95,7 @@ class ChunkTrainer:
         loss, mse = count * rest.loss(self.avatar, self.config.loss), torch.zeros(())
         for index, (name, frame), some in zip(chosen, frames, targets, strict=True):
             output = rest.output(self.avatar, int(index))
-            gaussians = self.avatar.gaussians(self.signals[name][[frame]], output)[0]
+            gaussians = self.avatar.gaussians(self.signals[name].windows[[frame]], output)[0]
             view = self._views(rng, gaussians, some, reduction)
             loss, mse = loss + view[0], mse + view[1]
         return self._backward(loss, mse, count)
@@ -157,7 +153,7 @@ class ChunkTrainer:
     ) -> "_Step":
         """Advance every rollout by one frame, some of them afresh."""
         self.state = self.state.restart(torch.tensor(fresh))
-        seen = motion_window = torch.stack([self.signals[p.sequence][p.frame] for p in cursors])
+        seen = motion_window = torch.stack([self.signals[p.sequence].windows[p.frame] for p in cursors])
         mirrored = torch.tensor([cursor.mirrored for cursor in cursors])
         if self.mirror is not None:
             seen = torch.where(
@@ -226,7 +222,7 @@ class ChunkTrainer:
 
     def _spatial(self, output: NetworkOutput) -> Tensor:
         offsets = self.avatar.gather_control_points(output.offset)
-        return self.config.loss.spatial * spatial_loss(offsets, self.avatar.surface_edges)
+        return self.config.loss.spatial * spatial_loss(offsets, self.avatar.control.edges)
 
     def _registered_distance(self, step: "_Step") -> Tensor:
         """Return the mean distance, cm, to the registered maps; frames without one count as reached."""
@@ -258,7 +254,7 @@ class ChunkTrainer:
         ages = [cursor.age for cursor in step.cursors]
         occupied, loss = avatar.network.occupied, self.config.loss
         return temporal_losses(
-            list(self.records), list(self.speeds), ages, occupied, avatar.control_cells, loss
+            list(self.records), list(self.speeds), ages, occupied, avatar.control.cells, loss
         )
 
     def _backward(self, loss: Tensor, mse: Tensor | None, count: int) -> UpdateMetrics:

@@ -232,7 +232,7 @@ def training_clips(capture: Capture) -> dict[str, range]:
 def still_frames(trainer: ChunkTrainer, fps: float) -> list[tuple[str, int]]:
     """Return the near-rest training frames that the template is fitted to."""
     clips = trainer.rollouts.clips
-    transforms = {name: trainer.signals[name][: clip.stop, 0] for name, clip in clips.items()}
+    transforms = {name: trainer.signals[name].transforms[: clip.stop] for name, clip in clips.items()}
     per_sequence = max(1, -(-STILL_FRAMES // len(clips)))
     return find_rest_frames(
         transforms, fps, STILL_FRAMES, per_sequence, trainer.loader.capture.cameras_with_image

@@ -10,8 +10,8 @@ import torch
 
 from dsar.avatar import rollout
 from dsar.avatar.avatar import Avatar
+from dsar.avatar.charts import Atlas, body_chart
 from dsar.avatar.rollout import roll_out
-from dsar.body.atlas import Atlas, body_chart
 from dsar.body.files import load_body
 from dsar.body.skinning import forward_kinematics, skin_points
 from dsar.config import ModelConfig
