@@ -5,7 +5,7 @@
 `rollout` is one frame of one person, without gradients, as in rendering and export; `frame` is that with
 everything around it, from the bones to an image of the embedded capture's person; `training` is one
 frame of a batch of rollouts with its backward pass (truncated after one frame), per rollout. The literal
-design (tests/literal_network.py) encodes all n frames at every step with the newest offsets, computes all
+design (`dsar.network.reference`) encodes all n frames at every step with the newest offsets, computes all
 rows of the attention, and doubles maps before it convolves them. Inputs are random: no network here runs
 faster for what it sees. GFLOP are those of convolutions and matrix products.
 """
@@ -39,12 +39,10 @@ from dsar.config import PRESETS, ModelConfig
 from dsar.data.captures.formats import open_capture
 from dsar.evaluation.profiling import count_stage_flops, read_clock, time_stages
 from dsar.network import DualStreamNetwork, NetworkOutput
+from dsar.network.reference import ReferenceNetwork, ReferenceRollout, doubling_kernels
 from dsar.network.session import InferenceSession
 from dsar.raster import rasterize
 from dsar.types import Motion, RenderOutput
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from literal_network import LiteralNetwork, LiteralRollout
 
 LITERAL = "literal"
 WIRINGS = ("shared", "late", "perframe")
@@ -111,8 +109,8 @@ def build(case: Case, design: str, device: str) -> Subject:
     torch.nn.init.normal_(network.decoder.head.weight, std=0.01)
     drawn = _draw(config, case, avatar.control.size, device)
     if design == LITERAL:
-        literal = LiteralNetwork(network).to(device)
-        rollout, training = LiteralRollout(literal), partial(_train_literal, literal, *drawn)
+        reference = ReferenceNetwork(network, doubling_kernels(network))
+        rollout, training = ReferenceRollout(reference), partial(_train_reference, reference, *drawn)
     else:
         rollout = InferenceSession(network, precision=torch.bfloat16 if device == "cuda" else None)
         network, training = rollout.network, partial(_train, network, *drawn)
@@ -151,12 +149,11 @@ def _train(network: DualStreamNetwork, maps: Tensor, magnitudes: Tensor) -> None
     _backward(network, output)
 
 
-def _train_literal(literal: LiteralNetwork, maps: Tensor, magnitudes: Tensor) -> None:
-    config, batch = literal.network.config, maps.shape[1]
-    state = literal.network.initial_state(batch)
-    offsets = [state.offsets.flatten(1, 2)] * config.window
-    output, _ = literal(list(maps), list(magnitudes), offsets, list(state.memory.unbind(1)))
-    _backward(literal, output)
+def _train_reference(reference: ReferenceNetwork, maps: Tensor, magnitudes: Tensor) -> None:
+    state = reference.network.initial_state(maps.shape[1])
+    frames = (maps.transpose(0, 1), magnitudes.transpose(0, 1))
+    output, _ = reference(*frames, state.offsets[:, -1], state.memory)
+    _backward(reference, output)
 
 
 def _backward(module: torch.nn.Module, output: NetworkOutput) -> None:

@@ -53,7 +53,7 @@ def time_stages(sequence: GaussianSequence, path: CameraPath, layers: tuple[Aov,
         if triplet is None:
             break
         marks.append(time.perf_counter())
-        rasterize(triplet.now, path.at(triplet.frame))
+        rasterize(triplet.current, path.at(triplet.frame))
         marks.append(time.perf_counter())
         picture = render_picture(triplet, path, settings, labels=labels, fps=sequence.fps)
         marks.append(time.perf_counter())

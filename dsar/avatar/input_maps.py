@@ -35,9 +35,9 @@ def make_input_maps(
     fps: float,
     model: ModelConfig,
 ) -> InputMaps:
-    """Return the input maps I = [p, dp] and motion magnitudes V of a batch of frames (paper equations 4, 6).
+    """Return the input maps p, dp and the motion magnitudes V = |dp| of a batch of frames (paper equation 6).
 
-    The third part of I, the previous offset, joins them in the network's encoder. Channels, in their order:
+    The previous offset joins them in the network's encoder. Channels, in their order:
 
     - position p: relative to the pelvis's place on the ground, turned by the inverse of its heading; height
       and the direction of gravity are the world's;

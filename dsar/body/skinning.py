@@ -51,7 +51,7 @@ def blend_transforms(
 def skin_points(
     points: Float[Tensor, "n 3"], weights: Float[Tensor, "n j"], transforms: Float[Tensor, "j 4 4"]
 ) -> Float[Tensor, "n 3"]:
-    """Return rest points (metres) carried by T_world_rest of the joints, blended by their weights."""
+    """Return rest points, metres, carried by T_world_rest of the joints, blended (paper equation 1)."""
     blended = blend_transforms(weights, transforms)
     return (blended[:, :, :3] @ points[:, :, None]).squeeze(-1) + blended[:, :, 3]
 

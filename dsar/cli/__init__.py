@@ -19,6 +19,7 @@ from dsar.cli.measure import Eval, Stress
 from dsar.cli.render import Render
 from dsar.cli.train import Train
 from dsar.config import PRESETS
+from dsar.config.migrations import rename_flags
 from dsar.errors import DsarError, RenderError, StorageError
 
 Command = Train | Check | Export | Render | Eval | Stress | Crosscheck
@@ -28,6 +29,7 @@ _NO_READER = 128 + signal.SIGPIPE
 
 def parse(arguments: Sequence[str]) -> Command:
     """Return the command that the arguments ask for; the preset decides the other defaults."""
+    arguments = rename_flags(arguments)
     command = _parse(arguments, "demo")
     if isinstance(command, Train) and command.preset != "demo":
         return _parse(arguments, command.preset)

@@ -21,7 +21,7 @@ from dsar.geometry.camera_paths import DOLLY, ORBIT, TURNTABLE, CameraPath, doll
 if TYPE_CHECKING:
     from dsar_exporters import ColorTarget
     from dsar_render import RenderSettings, Shot
-    from dsar_render.shot import PictureWriter
+    from dsar_render.writers import PictureWriter
 
 LOGGER = logging.getLogger(__name__)
 _MADE = {TURNTABLE: turntable, ORBIT: orbit, DOLLY: dolly}
@@ -144,7 +144,7 @@ class Render(DriveCommand):
         facts = dict(whole.provenance)
         # A video needs every frame.
         if self.skip_existing and self.mp4 is None:
-            frames = [frame for frame in frames if not shot.complete(frame, facts)]
+            frames = [frame for frame in frames if not shot.is_complete(frame, facts)]
         if not frames:
             return 0
         every = whole.frame_numbers

@@ -16,7 +16,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
 from dsar.errors import ConfigError
-from dsar.training.lpips import Lpips
+from dsar.metrics.lpips import Lpips
 
 CLIP, STRIDE = 16, 8
 """Frames of a clip, and from one clip's start to the next one's."""

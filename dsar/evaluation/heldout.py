@@ -19,16 +19,15 @@ from dsar.avatar.rollout import START_FRAME, roll_out
 from dsar.data.captures.multiview import MultiViewCapture
 from dsar.data.motions.mmd import motion_mmd
 from dsar.evaluation.garment_metrics import garment_mask, measure_garment
-from dsar.evaluation.image_metrics import ImageMetric, correlation, load_perceptual, psnr
+from dsar.evaluation.image_metrics import ImageMetric, correlation, load_perceptual
 from dsar.evaluation.profiling import read_clock, time_stages
 from dsar.evaluation.temporal_metrics import temporal_psnr, trace_back, warp_error
 from dsar.evaluation.videos import VIDEO_METRICS, evaluate_videos
 from dsar.evaluation.views import WHITE, View, render_white, true_view
+from dsar.metrics.images import mask_box, psnr, ssim
 from dsar.network import STREAMS, Stream
 from dsar.network.session import InferenceSession
 from dsar.raster import rasterize
-from dsar.training.losses import ssim
-from dsar.training.targets import mask_box
 from dsar.types import Camera, Capture, Gaussians
 
 _IMAGE_METRICS = (

@@ -8,23 +8,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dsar.training.lpips import Net, find_lpips_weights, load_lpips
+from dsar.metrics.lpips import Net, find_lpips_weights, load_lpips
 
 ImageMetric = Callable[[Float[Tensor, "h w 3"], Float[Tensor, "h w 3"]], float]
 """From an image and its truth."""
 
 
 _LPIPS: Mapping[str, Net] = {"lpips": "alex", "lpips_vgg": "vgg"}
-
-
-def psnr(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float:
-    """Return the peak signal-to-noise ratio in dB; values outside [0, 1] are clipped first."""
-    return decibels((image.clamp(0, 1) - truth.clamp(0, 1)).square().mean())
-
-
-def decibels(mse: Float[Tensor, ""]) -> float:
-    """Return the signal-to-noise ratio of a mean squared error against a peak of 1; 100 dB at most."""
-    return float(-10 * mse.clamp_min(1e-10).log10())
 
 
 def correlation(a: Float[Tensor, " n"], b: Float[Tensor, " n"]) -> float:

@@ -18,6 +18,7 @@ from plotly.offline import get_plotlyjs
 
 from dsar.atomic_files import write_text_atomically
 from dsar.config import PRESETS, TrainConfig, absolute_capture, config_to_json
+from dsar.config.migrations import RENAMED_STAGES
 from dsar.evaluation.study.chart import QUALITIES, chart_points, interactive_chart, training_time_series
 from dsar.evaluation.study.summary import table_cells
 from dsar.training.checkpoint import Run, read_config, read_json, read_progress
@@ -127,8 +128,8 @@ def _draw_curves(lines: list[dict[str, Any]]) -> Iterator[str]:
     for key, label in (("psnr", "PSNR of training crops, dB"), ("loss", "loss")):
         figure = go.Figure()
         for stage, colour in _STAGES.items():
-            part = [line for line in lines if line["stage"] == stage]
-            # Imitation sees no images.
+            part = [line for line in lines if RENAMED_STAGES.get(line["stage"], line["stage"]) == stage]
+            # Pre-training sees no images.
             if part and (key, stage) != ("psnr", "pretraining"):
                 steps, values = [line["step"] for line in part], [line[key] for line in part]
                 figure.add_scatter(x=steps, y=values, name=stage, line_color=colour)

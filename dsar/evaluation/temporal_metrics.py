@@ -9,8 +9,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from dsar.evaluation.image_metrics import decibels
 from dsar.geometry.cameras import project
+from dsar.metrics.images import decibels
 from dsar.types import Camera, Gaussians, RenderOutput
 
 _OPAQUE = 0.95

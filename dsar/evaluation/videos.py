@@ -14,8 +14,8 @@ from dsar.avatar.rollout import roll_out
 from dsar.evaluation.frechet import CLIP, Video, frechet_distance, i3d_features, load_i3d, slice_features
 from dsar.evaluation.views import render_white, to_bytes, true_view
 from dsar.evaluation.vmaf import vmaf, vmaf_missing
+from dsar.metrics.lpips import find_lpips_weights, load_lpips
 from dsar.network import STREAMS, Stream
-from dsar.training.lpips import find_lpips_weights, load_lpips
 from dsar.types import Capture
 
 VIDEO_METRICS = ("vmaf", "frechet_slices", "fvd")

@@ -1,7 +1,5 @@
 """Convolutional building blocks, initialised so that activations keep their variance (He et al. 2015)."""
 
-import itertools
-
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -75,30 +73,3 @@ class Upsample(nn.Module):
 def channels_last(x: Tensor) -> Tensor:
     """Lay a [b, c, h, w] tensor out pixel by pixel, which oneDNN's CPU convolutions prefer."""
     return x.contiguous(memory_format=torch.channels_last)
-
-
-class ShuffledUpsample(nn.Module):
-    """An `Upsample` as a 3x3 convolution to four times the channels, which become the pixels of a cell.
-
-    More than half of its kernel is zero. Yet on grids of a few hundred pixels, one rollout at a time, it
-    takes half the time of a transposed convolution.
-    """
-
-    def __init__(self, upsample: Upsample) -> None:
-        super().__init__()
-        weight, bias = upsample.conv.weight, upsample.conv.bias
-        inputs, outputs = weight.shape[:2]
-        # For each parity of an output pixel: where a tap is in this kernel, and where in the transposed one.
-        taps = (((0, 3), (1, 1)), ((1, 2), (2, 0)))
-        kernel = weight.new_zeros(outputs, 2, 2, inputs, 3, 3)
-        for (a, rows), (b, columns) in itertools.product(enumerate(taps), enumerate(taps)):
-            for (y, row), (x, column) in itertools.product(rows, columns):
-                kernel[:, a, b, :, y, x] = weight.detach()[:, :, row, column].T
-        self.weight = nn.Parameter(kernel.reshape(-1, inputs, 3, 3))
-        assert bias is not None
-        self.bias = nn.Parameter(bias.detach().repeat_interleave(4))
-
-    def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b d h2 w2"]:
-        """Return features at twice the resolution."""
-        x = nn.functional.conv2d(x, self.weight, self.bias, padding=1)
-        return nn.functional.pixel_shuffle(activate(x), 2)

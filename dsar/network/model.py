@@ -1,24 +1,24 @@
-"""The network of the paper's section 3: one step of the autoregression for a batch of rollouts."""
+"""The network of the paper's section 3.4: one step of the autoregression for a batch of rollouts."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 
 from dsar.config import ModelConfig
-from dsar.network.decoder import Decoder, LinearBases
-from dsar.network.encoder import OFFSET_WIRINGS, WindowFeatures
-from dsar.network.state import NetworkState, fill_where_fresh, push
-from dsar.network.temporal import MemoryBank, MotionEmbedding, TemporalAggregation, TemporalAttention
+from dsar.network.decoder import ResidualDecoder
+from dsar.network.encoder import WindowEncoder, WindowFeatures
+from dsar.network.memory import MemoryBank
+from dsar.network.positions import PositionTable
+from dsar.network.pyramid import level_size
+from dsar.network.readout import Readout
+from dsar.network.state import STREAMS, NetworkState, Stream, fill_where_fresh, push
+from dsar.network.temporal import MotionEmbedding, TemporalAggregation, TemporalAttention
 
 OFFSET_UNIT = 0.1
 """Metres of offset that the geometric stream presents to the encoder as 1."""
-Stream = Literal["geometric", "state"]
-STREAMS: tuple[Stream, ...] = ("geometric", "state")
-"""Both: previous offsets fed back, and the memory bank."""
 
 
 @dataclass(frozen=True)
@@ -39,87 +39,68 @@ class NetworkOutput:
         return NetworkOutput(self.offset[index], self.appearance[index], features)
 
 
-@dataclass(frozen=True)
-class PositionTable:
-    """What depends on where in the window the frames of each age are."""
-
-    table: Float[Tensor, "*p n _"]
-    """Side by side: what each frame's age adds to its key and value, and its weights in the aggregates of
-    shallow levels, finest first."""
-    widths: tuple[int, ...]
-    """Their channels."""
-    positions: Int64[Tensor, "*p n"] | None
-    """Each frame's age, 0 the oldest, where all of them ask and not the newest alone."""
-
-    @classmethod
-    def build(cls, network: "DualStreamNetwork", order: Int64[Tensor, "*p n"]) -> "PositionTable":
-        """Return those of frames in an order, or in each of several."""
-        weights = (mix.get_parameter("weights")[order] for mix in network.aggregation)
-        columns = [network.attention.position_bias(order), *weights]
-        widths = tuple(column.shape[-1] for column in columns)
-        return cls(torch.cat(columns, -1), widths, order if network.config.readout == "mean" else None)
-
-    def select(self, index: Int64[Tensor, "1"]) -> "PositionTable":
-        """Return those of one of several orders."""
-        order = None if self.positions is None else self.positions.index_select(0, index)[0]
-        return PositionTable(self.table.index_select(0, index)[0], self.widths, order)
-
-    def columns(self) -> tuple[Float[Tensor, "*p n _"], ...]:
-        """Return the parts of the table."""
-        return self.table.split(self.widths, -1)
-
-
 class DualStreamNetwork(nn.Module):
     """Encoder, temporal aggregation, memory bank and decoder around the two recurrent streams.
 
     `forward` is one step of training. A rollout that needs no gradients goes through
-    `dsar.network.session`, which takes the same steps and keeps what does not change.
+    `dsar.network.session`, which takes the same steps and keeps what does not change. Both are held to
+    `dsar.network.reference`, which reads as the paper does.
     """
 
-    def __init__(self, config: ModelConfig, occupied: Bool[Tensor, "h w"]) -> None:
+    def __init__(
+        self,
+        config: ModelConfig,
+        occupied: Bool[Tensor, "h w"],
+        *,
+        encoder: WindowEncoder,
+        motion_embedding: MotionEmbedding | None,
+        attention: TemporalAttention,
+        readout: Readout,
+        bank: MemoryBank | None,
+        aggregation: Iterable[TemporalAggregation],
+        decoder: ResidualDecoder,
+    ) -> None:
+        """Compose a network of its parts (`dsar.network.build_network` makes them).
+
+        `occupied` are the cells of the maps that hold Gaussians. Without a bank there is no state stream.
+        """
         super().__init__()
         self.config = config
         self.register_buffer("occupied", occupied[None, None].float())
         self.occupied: Tensor
-        channels, deepest, fine = config.channels, config.channels[-1], config.pixel_shuffle
-        self.grid = (occupied.shape[0] // fine, occupied.shape[1] // fine)
-        self.encoder = OFFSET_WIRINGS[config.wiring](config, self.grid)
-        self.motion_embedding = MotionEmbedding(deepest) if config.motion_embedding else None
-        self.attention = TemporalAttention(deepest, config.heads, config.window)
-        self.bank = (
-            MemoryBank(deepest, config.heads, config.memory, config.memory_weight) if config.memory else None
-        )
-        self.aggregation = nn.ModuleList(TemporalAggregation(c, config.window) for c in channels[:-1])
-        outputs, coarse = fine**2 * (3 + config.appearance_channels), self.level_size(len(channels) - 1)
-        self.decoder = (
-            LinearBases(deepest * coarse[0] * coarse[1], outputs, self.grid, config.bases)
-            if config.bases
-            else Decoder(channels, outputs)
-        )
+        self.encoder = encoder
+        self.motion_embedding = motion_embedding
+        self.attention = attention
+        self.readout = readout
+        self.bank = bank
+        self.aggregation = nn.ModuleList(aggregation)
+        self.decoder = decoder
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        """Height and width of the finest level of the hierarchy."""
+        height, width = self.occupied.shape[2:]
+        return height // self.config.pixel_shuffle, width // self.config.pixel_shuffle
 
     def hidden_weights(self) -> list[nn.Parameter]:
         """Return the convolutions' weights between the inputs and the head."""
         others = (self.encoder.uv_features, self.decoder.head.weight)
         return [p for p in self.parameters() if p.ndim == 4 and not any(p is other for other in others)]
 
-    def level_size(self, level: int) -> tuple[int, int]:
-        """Return height and width of a level of the hierarchy, 0 the finest."""
-        return -(-self.grid[0] // 2**level), -(-self.grid[1] // 2**level)
-
     def initial_state(self, batch: int) -> NetworkState:
         """Return the state of rollouts that have seen nothing yet."""
         c, zeros, deepest = self.config, self.occupied.new_zeros, len(self.config.channels) - 1
 
-        def ring(length: int, channels: int, level: int) -> Tensor:
-            return zeros(batch, length, *self.level_size(level), channels).movedim(-1, 2)
+        def entries(length: int, channels: int, level: int) -> Tensor:
+            return zeros(batch, length, *level_size(self.grid, level), channels).movedim(-1, 2)
 
-        kept = enumerate(self.encoder.cached_channels())
+        cached = enumerate(self.encoder.cached_channels())
         return NetworkState(
             fresh=torch.ones(batch, dtype=torch.bool, device=self.occupied.device),
-            window=tuple(ring(c.window, count, level) for level, count in kept),
-            motion=ring(c.window * c.motion_embedding, c.channels[-1], deepest),
+            window=tuple(entries(c.window, count, level) for level, count in cached),
+            motion=entries(c.window * c.motion_embedding, c.channels[-1], deepest),
             offsets=zeros(batch, c.feedback, 3, *self.occupied.shape[2:]),
-            memory=ring(c.memory, c.channels[-1], deepest),
+            memory=entries(c.memory, c.channels[-1], deepest),
         )
 
     def forward(
@@ -138,34 +119,23 @@ class DualStreamNetwork(nn.Module):
         """
         offsets = self.offset_input(state.offsets, streams)
         static = self.encoder.static_term()
-        kept = self.encoder.encode_frame(self.unshuffle(maps), offsets, static)
-        rings = [push(old, new, state.fresh) for old, new in zip(state.window, kept, strict=True)]
-        precomputed = self.encoder.precompute([ring.flatten(0, 1) for ring in rings], static)
-        frames = [each.unflatten(0, rings[0].shape[:2]) for each in precomputed]
+        frame = self.encoder.encode_frame(self.unshuffle(maps), offsets, static)
+        cached = [push(old, new, state.fresh) for old, new in zip(state.window, frame, strict=True)]
+        precomputed = self.encoder.precompute([entries.flatten(0, 1) for entries in cached], static)
+        frames = [level.unflatten(0, cached[0].shape[:2]) for level in precomputed]
         window, motion = self.encoder.assemble_window(frames, offsets), state.motion
         deep = window.frames[-1]
         if self.motion_embedding is not None:
             motion = push(motion, self.embed_motion(magnitude), state.fresh)
-            deep = deep + motion
-        queries = deep if self.config.readout == "mean" else deep[:, -1:]
-        positions = PositionTable.build(self, torch.arange(self.config.window, device=deep.device))
+            deep = window.motion_enhanced(motion)
+        queries = deep if self.readout.reads_all_rows else deep[:, -1:]
+        positions = self.position_table(torch.arange(self.config.window, device=deep.device))
         aggregate = self.aggregate(queries, self.attention.project_keys_values(deep), window, positions)
-        hidden, memory = aggregate, state.memory
-        if self.bank is not None:
-            newest = (
-                deep[:, -1] if window.offset_features is None else deep[:, -1] + window.offset_features[-1]
-            )
-            first = aggregate if self.config.bank == "hidden" else newest
-            recalled = fill_where_fresh(state.fresh, first, memory)
-            if "state" not in streams:
-                recalled = first[:, None].expand_as(memory)
-            attention = self.bank.attention
-            hidden = self.bank(aggregate, attention.project_keys_values(recalled), attention.position_bias())
-            memory = push(recalled, hidden if self.config.bank == "hidden" else newest, state.fresh)
+        hidden, memory = self._remember(aggregate, window.add_offset_features(deep[:, -1]), state, streams)
         output = self.decode(window, hidden, positions)
         next_state = NetworkState(
             fresh=torch.zeros_like(state.fresh),
-            window=tuple(rings),
+            window=tuple(cached),
             motion=motion,
             offsets=torch.cat([state.offsets, output.offset[:, None]], 1)[:, 1:],
             memory=memory,
@@ -185,48 +155,64 @@ class DualStreamNetwork(nn.Module):
         return scaled if "geometric" in streams else torch.zeros_like(scaled)
 
     def embed_motion(self, magnitude: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b c h2 w2"]:
-        """Return the embedding of a motion magnitude at the deepest level."""
+        """Return the embedding of a motion magnitude at the coarsest level."""
         assert self.motion_embedding is not None
-        coarse = self.level_size(len(self.config.channels) - 1)
+        coarse = level_size(self.grid, len(self.config.channels) - 1)
         return self.motion_embedding(nn.functional.adaptive_avg_pool2d(magnitude, coarse))
+
+    def position_table(self, positions: Int64[Tensor, "*p n"]) -> PositionTable:
+        """Return what follows from frames' positions in the window, for one order of frames or several."""
+        weights = [level.get_parameter("weights") for level in self.aggregation]
+        return PositionTable.build(self.attention, weights, positions)
 
     def aggregate(
         self,
         queries: Float[Tensor, "b q c h w"],
-        frames: Float[Tensor, "b n h w d"],
+        key_values: Float[Tensor, "b n h w d"],
         window: WindowFeatures,
         positions: PositionTable,
     ) -> Float[Tensor, "b c h w"]:
-        """Return A: what the newest frame finds in the window, or the mean of what every frame finds.
+        """Return A, what the readout makes of the attention over the window.
 
-        `queries` is the newest frame, or all of them in the order of `frames`, their keys and values.
+        `queries` are f + m of the newest frame, or of all in the order of `key_values`.
         """
-        order, position_embedding, future_mask = (
-            positions.positions,
-            self.attention.position_embedding[-1:],
-            None,
-        )
-        if order is not None:
-            position_embedding = self.attention.position_embedding[order]
-            future_mask = order[:, None] < order if self.config.causal else None
         offset_features = None if window.offset_features is None else window.offset_features[-1]
         if offset_features is not None:
             queries = queries + offset_features[:, None]
-        queries = queries + position_embedding[:, :, None, None]
-        attended = self.attention.attend(
-            queries, frames, positions.columns()[0], offset_features=offset_features, future_mask=future_mask
+        embedding = self.readout.query_embedding(self.attention.position_embedding, positions.positions)
+        rows = self.attention.attend(
+            queries + embedding[:, :, None, None],
+            key_values,
+            positions.key_value_bias,
+            offset_features=offset_features,
+            future_mask=self.readout.future_mask(positions.positions),
         )
-        return attended[:, 0] if order is None else attended.mean(1)
+        return self.readout.reduce(rows)
+
+    def _remember(
+        self, aggregate: Tensor, features: Tensor, state: NetworkState, streams: Collection[Stream]
+    ) -> tuple[Tensor, Tensor]:
+        """Return h of the newest frame, whose features these are, and the next step's memory."""
+        bank, memory = self.bank, state.memory
+        if bank is None:
+            return aggregate, memory
+        first = bank.first_entry(aggregate, features)
+        memory = fill_where_fresh(state.fresh, first, memory)
+        if "state" not in streams:
+            memory = first[:, None].expand_as(memory)
+        key_values = bank.attention.project_keys_values(memory)
+        hidden = bank(aggregate, key_values, bank.attention.position_bias())
+        return hidden, bank.update(memory, bank.entry(hidden, features), state.fresh)
 
     def decode(
         self, window: WindowFeatures, hidden: Float[Tensor, "b c h w"], positions: PositionTable
     ) -> NetworkOutput:
         """Return the residual maps of the newest frame."""
         offset_features = window.offset_features or (None,) * len(window.frames)
-        shallow = zip(self.aggregation, window.frames, offset_features, positions.columns()[1:], strict=False)
-        features = [
-            mix(frames, offset_features, weights) for mix, frames, offset_features, weights in shallow
-        ] + [hidden]
+        weights = positions.aggregation_weights
+        shallow = zip(self.aggregation, window.frames, offset_features, weights, strict=False)
+        features = [level(*inputs) for level, *inputs in shallow]
+        features.append(hidden)
         raw = self.decoder(features)
         if self.config.pixel_shuffle > 1:
             raw = nn.functional.pixel_shuffle(raw, self.config.pixel_shuffle)

@@ -1,12 +1,17 @@
-"""What the network remembers between frames."""
+"""What the network remembers between frames: the paper's two streams, and the sliding window."""
 
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+
+Stream = Literal["geometric", "state"]
+STREAMS: tuple[Stream, ...] = ("geometric", "state")
+"""Both: previous offsets fed back, and the memory bank."""
 
 
 @dataclass(frozen=True)
@@ -52,19 +57,19 @@ class NetworkState:
 
 
 def fill_where_fresh(
-    fresh: Bool[Tensor, " b"], newest: Float[Tensor, "b *s"], ring: Float[Tensor, "b n *s"]
+    fresh: Bool[Tensor, " b"], newest: Float[Tensor, "b *s"], entries: Float[Tensor, "b n *s"]
 ) -> Float[Tensor, "b n *s"]:
-    """Return the ring, or copies of the newest entry for rollouts that have no history yet."""
+    """Return the entries, or copies of the newest one for rollouts that have no history yet."""
     if not fresh.any():
-        return ring
-    mask = fresh.reshape(-1, *[1] * (ring.ndim - 1))
-    return torch.where(mask, newest[:, None], ring)
+        return entries
+    mask = fresh.reshape(-1, *[1] * (entries.ndim - 1))
+    return torch.where(mask, newest[:, None], entries)
 
 
 def push(
-    ring: Float[Tensor, "b n c h w"], newest: Float[Tensor, "b c h w"], fresh: Bool[Tensor, " b"]
+    entries: Float[Tensor, "b n c h w"], newest: Float[Tensor, "b c h w"], fresh: Bool[Tensor, " b"]
 ) -> Float[Tensor, "b n c h w"]:
-    """Drop the oldest entry of a ring and append the newest; without history it fills the ring."""
+    """Drop the oldest entry and append the newest; without history it fills all places."""
     newest = newest.movedim(1, -1)
-    history = fill_where_fresh(fresh, newest, ring.movedim(2, -1))
+    history = fill_where_fresh(fresh, newest, entries.movedim(2, -1))
     return torch.cat([history[:, 1:], newest[:, None]], 1).movedim(-1, 2)

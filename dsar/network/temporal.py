@@ -1,7 +1,7 @@
-"""Motion-adaptive temporal aggregation and the memory bank (paper sections 3.3 and 3.4).
+"""Motion-adaptive temporal aggregation (paper section 3.4, geometric stream).
 
-Frames come oldest first, or in any other `order`: then entry i is the frame of age order[i], 0 the oldest,
-n - 1 the newest.
+Frames come oldest first, or in any other order together with their `positions`: entry i of the tensor is the
+frame at position positions[i] in time, 0 the oldest, n - 1 the newest.
 """
 
 import torch
@@ -13,7 +13,7 @@ from dsar.network.layers import ConvBlock, activate, channels_last, conv, per_pi
 
 
 class MotionEmbedding(nn.Module):
-    """Embed the motion magnitude V into feature space (paper equation 7)."""
+    """Phi_m: embed the motion magnitude V into feature space, m = Phi_m(V) (paper equation 7)."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -28,10 +28,10 @@ class MotionEmbedding(nn.Module):
 
 
 class TemporalAttention(nn.Module):
-    """Multi-head attention of frames to frames, at each pixel by itself (paper equations 9-12).
+    """Multi-head attention of frames to frames, at each pixel by itself.
 
-    A learnt embedding of a frame's age is part of what its key and value are made of. Both are linear, so
-    they can be projected once and given their ages as they grow older.
+    A learnt embedding of a frame's position in time is part of what its key and value are made of. Both are
+    linear, so they can be projected once and given the position's share as they grow older.
     """
 
     def __init__(self, channels: int, heads: int, length: int) -> None:
@@ -49,15 +49,16 @@ class TemporalAttention(nn.Module):
         self._frozen = self._key_value_weights()
 
     def project_keys_values(self, frames: Float[Tensor, "b n c h w"]) -> Float[Tensor, "b n h w _"]:
-        """Return keys and values of frames side by side, without their ages."""
+        """Return K and V of frames side by side, without the positions' share (paper equation 9).
+
+        Queries are projected where they attend.
+        """
         return linear(frames.movedim(2, -1), *self._key_value_weights())
 
-    def position_bias(self, order: Int64[Tensor, "*p n"] | None = None) -> Float[Tensor, "*p n d"]:
-        """Return what their ages add to the keys and values of frames."""
-        return linear(
-            self.position_embedding if order is None else self.position_embedding[order],
-            self._key_value_weights()[0],
-        )
+    def position_bias(self, positions: Int64[Tensor, "*p n"] | None = None) -> Float[Tensor, "*p n d"]:
+        """Return what their positions add to the keys and values of frames; None: they are in order."""
+        embedding = self.position_embedding if positions is None else self.position_embedding[positions]
+        return linear(embedding, self._key_value_weights()[0])
 
     def _key_value_weights(self) -> tuple[Float[Tensor, "d c"], Float[Tensor, " d"]]:
         """Return the weights and the bias of both, one above the other; keys have the scores' scale."""
@@ -78,52 +79,29 @@ class TemporalAttention(nn.Module):
         offset_features: Float[Tensor, "b c h w"] | None = None,
         future_mask: Bool[Tensor, "q n"] | None = None,
     ) -> Float[Tensor, "b q c h w"]:
-        """Return what each query finds among frames given by `project_keys_values` and `position_bias`.
+        """Return the attention's row of each query, softmax(Q K^T / sqrt(d) + M) V (paper equation 11).
 
-        `offset_features` were to be added to every frame before they were projected. Entries of
-        `future_mask` are hidden from a query.
+        `key_values` and `position_bias` are `project_keys_values` and `position_bias` of the frames.
+        `offset_features` were to be added to every frame before that. Entries of `future_mask` are hidden
+        from a query.
         """
         key_value_bias = position_bias[:, None, None]
         if offset_features is not None:
-            key_value_bias = (
-                key_value_bias + linear(offset_features.movedim(1, -1), self._key_value_weights()[0])[:, None]
-            )
+            offset_bias = linear(offset_features.movedim(1, -1), self._key_value_weights()[0])
+            key_value_bias = key_value_bias + offset_bias[:, None]
         b, n, h, w, _ = key_values.shape
         keys, values = (key_values + key_value_bias).view(b, 1, n, h, w, 2, self.heads, -1).unbind(-3)
-        projected_queries = per_pixel(self.query, queries.movedim(2, -1)).view(
-            b, -1, 1, h, w, self.heads, keys.shape[-1]
-        )
-        scores = (projected_queries * keys).sum(-1, keepdim=True)
+        projected = per_pixel(self.query, queries.movedim(2, -1))
+        projected = projected.view(b, -1, 1, h, w, self.heads, keys.shape[-1])
+        scores = (projected * keys).sum(-1, keepdim=True)
         if future_mask is not None:
             scores = scores.masked_fill(future_mask[:, :, None, None, None, None], -torch.inf)
         mixed = (scores.softmax(2) * values).sum(2)
         return per_pixel(self.out, mixed.flatten(-2)).movedim(-1, 2)
 
 
-class MemoryBank(nn.Module):
-    """Mix the aggregate of the window with what the bank recalls (paper equations 12-13)."""
-
-    def __init__(self, channels: int, heads: int, length: int, memory_weight: float) -> None:
-        super().__init__()
-        self.attention = TemporalAttention(channels, heads, length)
-        self.memory_logit = nn.Parameter(torch.tensor(memory_weight).logit())
-
-    def forward(
-        self,
-        aggregate: Float[Tensor, "b c h w"],
-        key_values: Float[Tensor, "b m h w d"],
-        position_bias: Float[Tensor, "m d"],
-    ) -> Float[Tensor, "b c h w"]:
-        """Return h = (1 - lambda) A + lambda CrossAttn(A, M), lambda = sigmoid(memory_logit).
-
-        `key_values` and `position_bias` are the attention's own projections of the bank.
-        """
-        recalled = self.attention.attend(aggregate[:, None], key_values, position_bias)[:, 0]
-        return aggregate.lerp(recalled, self.memory_logit.sigmoid())
-
-
 class TemporalAggregation(nn.Module):
-    """Aggregate one shallow level over the window: a depthwise temporal filter, then 1x1 (equation 15)."""
+    """Phi_agg: a shallow level of the window by a depthwise temporal filter, then 1x1 (paper equation 15)."""
 
     def __init__(self, channels: int, length: int) -> None:
         super().__init__()
@@ -139,7 +117,7 @@ class TemporalAggregation(nn.Module):
         offset_features: Float[Tensor, "b c h w"] | None,
         weights: Float[Tensor, "n c"],
     ) -> Float[Tensor, "b c h w"]:
-        """Return the mixture of n frames, to each of which `common` is added.
+        """Return the mixture of n frames, to each of which `offset_features` are added.
 
         `weights` are this layer's, in the order of the frames.
         """

@@ -16,7 +16,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from dsar.config import TrainConfig
 from dsar.errors import ConfigError
-from dsar.network import DualStreamNetwork, NetworkState
+from dsar.network import NetworkState, build_network
 
 _log = logging.getLogger(__name__)
 _BYTES_PER_PARAMETER = 16
@@ -51,7 +51,7 @@ def estimate(config: TrainConfig) -> Budget:
     """Return what the settings ask for."""
     size, schedule = map_size(config), config.schedule
     with torch.device("meta"):
-        network = DualStreamNetwork(config.model, torch.ones(size, dtype=torch.bool))
+        network = build_network(config.model, torch.ones(size, dtype=torch.bool))
         state = network.initial_state(schedule.rollouts_per_worker)
         maps = torch.empty(schedule.rollouts_per_worker, config.model.map_channels, *size)
         magnitude = torch.empty(schedule.rollouts_per_worker, 1, *size)

@@ -21,12 +21,12 @@ from dsar.config import TrainConfig, config_to_json, with_absolute_paths
 from dsar.data.captures.formats import capture_of
 from dsar.data.captures.multiview import MultiViewCapture
 from dsar.errors import CaptureError, CheckpointError, ConfigError, TrainingError
+from dsar.metrics.lpips import load_lpips
 from dsar.training import checkpoint as ckpt
 from dsar.training import workers
 from dsar.training.budget import check_budget
 from dsar.training.checkpoint import Run
 from dsar.training.chunk import ChunkTrainer, UpdateMetrics
-from dsar.training.lpips import load_lpips
 from dsar.training.optimizers import make_optimizers, set_rates
 from dsar.training.registration import Registration
 from dsar.training.report import REPORT_EVERY, Monitor, Reporter

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import torch
 from jaxtyping import Float, Int64
@@ -10,6 +9,7 @@ from torch import Tensor
 
 from dsar.avatar.input_maps import REFERENCE_FPS
 from dsar.config import LossConfig
+from dsar.metrics.images import ssim
 from dsar.network import NetworkOutput
 from dsar.training.fused_loss import fused_image_loss
 from dsar.training.targets import Target
@@ -19,7 +19,6 @@ _GAMMA = 0.1
 CENTIMETRES = 100.0
 _KNEE = 0.5
 """Centimetres below which a distance is squared after all, to be smooth."""
-_SSIM_WINDOW, _SSIM_SIGMA = 11, 1.5
 
 
 def pyramid_l1(
@@ -35,29 +34,6 @@ def pyramid_l1(
         difference = torch.nn.functional.avg_pool2d(difference, 2, ceil_mode=True, count_include_pad=False)
         total = total + difference.abs().mean()
     return total / levels
-
-
-def ssim(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
-    """Return the mean structural similarity of two images in [0, 1] (Wang et al. 2004; 11x11 Gaussian)."""
-    x, y = image.permute(2, 0, 1), target.permute(2, 0, 1)
-    moments = torch.cat([x, y, x * x, y * y, x * y])
-    # As two products with banded matrices, four times faster than single-channel convolutions.
-    rows, columns = (_blur_matrix(size).to(image) for size in image.shape[:2])
-    moments = rows @ moments @ columns.mT
-    mx, my, mxx, myy, mxy = moments.chunk(5)
-    vx, vy, vxy = mxx - mx * mx, myy - my * my, mxy - mx * my
-    c1, c2 = 0.01**2, 0.03**2
-    score = (2 * mx * my + c1) * (2 * vxy + c2) / ((mx * mx + my * my + c1) * (vx + vy + c2))
-    return score.mean()
-
-
-@lru_cache(maxsize=512)
-def _blur_matrix(size: int) -> Float[Tensor, "s s"]:
-    """Return the matrix that blurs a line of pixels with SSIM's window, zero outside."""
-    distance = torch.arange(size)[:, None] - torch.arange(size)
-    window = torch.exp(-(distance**2) / (2 * _SSIM_SIGMA**2)) * (distance.abs() <= _SSIM_WINDOW // 2)
-    reach = torch.arange(_SSIM_WINDOW) - _SSIM_WINDOW // 2
-    return window / torch.exp(-(reach**2) / (2 * _SSIM_SIGMA**2)).sum()
 
 
 def plain_image_loss(

@@ -1,7 +1,7 @@
 """Muon (Jordan et al. 2024): momentum whose matrix is orthogonalised before it is applied.
 
 All directions of a step get the same length. In short runs the cloth's dynamics were learnt in fewer updates
-than with Adam (docs/log.md).
+than with Adam (docs/log/losses-and-schedule.md).
 
 After each step a weight gets back the norm it had (Karras et al. 2024, EDM2). Steps of a fixed length would
 make it grow with their number, and nothing in this network normalises: in 3,000 updates its features grew

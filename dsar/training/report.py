@@ -3,13 +3,13 @@
 import dataclasses
 import json
 import logging
-import math
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from dsar.atomic_files import naming_storage_errors
+from dsar.metrics.images import decibels
 from dsar.training.chunk import UpdateMetrics
 
 _log = logging.getLogger(__name__)
@@ -84,7 +84,7 @@ class Monitor:
             self._reporter(self._line(step, progress, stage, seconds, done))
 
     def _line(self, step: int, progress: float, stage: str, seconds: float, done: UpdateMetrics) -> Report:
-        psnr = -10 * math.log10(max(done.mse or 0.0, 1e-10))
+        psnr = decibels(done.mse or 0.0)
         gained = progress - self._began
         left = seconds * (1 - progress) / gained if gained > 0 else None
         return Report(step, self._steps, progress, stage, done.loss, psnr, seconds, left, done.gradients)

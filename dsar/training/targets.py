@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Shaped
+from jaxtyping import Float
 from torch import Tensor
 
+from dsar.metrics.images import mask_box
 from dsar.raster.jit import kernel
 from dsar.types import Camera, Capture
 
@@ -84,14 +85,3 @@ def _premultiplied_means(pixels, x0, y0, x1, y1, n):
             out[0], out[1], out[2] = red * per_color, green * per_color, blue * per_color
             alpha[y - y0, x - x0] = cover * per_alpha
     return color, alpha
-
-
-def mask_box(alpha: Shaped[np.ndarray, "h w"], margin: int) -> tuple[int, int, int, int]:
-    """Return (x0, y0, x1, y1) of what is not transparent, with a margin; the whole image if nothing is."""
-    h, w = alpha.shape
-    rows, columns = np.flatnonzero(alpha.any(1)), np.flatnonzero(alpha.any(0))
-    if not len(rows):
-        return 0, 0, w, h
-    x0, x1 = max(int(columns[0]) - margin, 0), min(int(columns[-1]) + 1 + margin, w)
-    y0, y1 = max(int(rows[0]) - margin, 0), min(int(rows[-1]) + 1 + margin, h)
-    return x0, y0, x1, y1

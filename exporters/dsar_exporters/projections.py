@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from dsar.types import Camera, Gaussians, GaussianSequence, Picture, RenderOutput
 from dsar_exporters.exr import ExrSequence
-from dsar_exporters.exr.header import read_projections
+from dsar_exporters.exr.camera_attributes import read_projections
 from dsar_exporters.usd import read_usd_projections, write_usd
 
 Projections = dict[str, Float[np.ndarray, "4 4"]]

@@ -31,57 +31,61 @@ def sample_deep(
     directions = torch.nn.functional.normalize(gaussians.means - camera.center.to(gaussians.means), dim=-1)
     colors = color_from_harmonics(gaussians.harmonics, directions).numpy()
     z = project(camera, gaussians.means)[1].double().numpy()
-    before = _accumulated(counts, weights)
-    groups = _groups(counts, weights, before, max_samples)
+    before = _alpha_in_front(counts, weights)
+    groups = _sample_of_each(counts, weights, before, max_samples)
     starts = np.flatnonzero(np.diff(groups, prepend=-1))
     pixels = np.repeat(np.arange(len(counts)), counts)[starts]
-    total = _sum(weights, starts)
-    depths = _sum(weights * z[ids], starts) / total
+    total = _sum_runs(weights, starts)
+    depths = _sum_runs(weights * z[ids], starts) / total
     sampled = np.bincount(pixels, minlength=len(counts)).reshape(output.alpha.shape)
-    heaviest = ids[_heaviest(weights, groups, starts)]
+    largest = ids[_argmax_weight(weights, groups, starts)]
     return DeepSamples(
         counts=torch.from_numpy(sampled),
-        colors=_float32(_sum(weights[:, None] * colors[ids], starts) / total[:, None]),
+        colors=_float32(_sum_runs(weights[:, None] * colors[ids], starts) / total[:, None]),
         alphas=_float32(total / (1 - before[starts])),
-        depths=_float32(_never_falling(depths, pixels)),
-        ids=torch.from_numpy(heaviest.astype(np.int64)),
+        depths=_float32(_non_decreasing(depths, pixels)),
+        ids=torch.from_numpy(largest.astype(np.int64)),
     )
 
 
-def _accumulated(counts: Int[np.ndarray, " p"], weights: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
-    """Return the alpha of all that lies before each share in its pixel."""
+def _alpha_in_front(
+    counts: Int[np.ndarray, " p"], weights: Float[np.ndarray, " m"]
+) -> Float[np.ndarray, " m"]:
+    """Return the alpha of all that lies in front of each contribution in its pixel."""
     total = np.concatenate([[0.0], np.cumsum(weights)])
     return total[:-1] - np.repeat(total[np.cumsum(counts) - counts], counts)
 
 
-def _groups(
+def _sample_of_each(
     counts: Int[np.ndarray, " p"],
     weights: Float[np.ndarray, " m"],
     before: Float[np.ndarray, " m"],
-    most: int,
+    max_samples: int,
 ) -> Int[np.ndarray, " m"]:
-    """Return which sample each share becomes part of: numbers that never fall and rise at every new pixel."""
+    """Return each contribution's sample: numbers that never fall, and rise at every new pixel."""
     pixels = np.repeat(np.arange(len(counts)), counts)
     order = np.arange(len(weights)) - (np.cumsum(counts) - counts)[pixels]
     alphas = np.bincount(pixels, weights, len(counts))[pixels]
-    quantile = np.minimum((before / alphas * most).astype(np.int64), most - 1)
-    within = np.where(counts[pixels] > most, quantile, order)
-    return pixels * (int(counts.max(initial=0)) + most) + within
+    quantile = np.minimum((before / alphas * max_samples).astype(np.int64), max_samples - 1)
+    within = np.where(counts[pixels] > max_samples, quantile, order)
+    return pixels * (int(counts.max(initial=0)) + max_samples) + within
 
 
-def _sum(values: Float[np.ndarray, "m *c"], starts: Int[np.ndarray, " s"]) -> Float[np.ndarray, "s *c"]:
+def _sum_runs(values: Float[np.ndarray, "m *c"], starts: Int[np.ndarray, " s"]) -> Float[np.ndarray, "s *c"]:
     """Return the sums of runs of values."""
     return np.add.reduceat(values, starts, axis=0) if len(starts) else values[:0]
 
 
-def _heaviest(
+def _argmax_weight(
     weights: Float[np.ndarray, " m"], groups: Int[np.ndarray, " m"], starts: Int[np.ndarray, " s"]
 ) -> Int[np.ndarray, " s"]:
     """Return where the largest weight of each group stands."""
     return np.lexsort((-weights, groups))[starts]
 
 
-def _never_falling(depths: Float[np.ndarray, " s"], pixels: Int[np.ndarray, " s"]) -> Float[np.ndarray, " s"]:
+def _non_decreasing(
+    depths: Float[np.ndarray, " s"], pixels: Int[np.ndarray, " s"]
+) -> Float[np.ndarray, " s"]:
     """Return depths in which none lies before the one in front of it, by the last digit of its rounding."""
     while True:
         wrong = np.flatnonzero((np.diff(depths) < 0) & (np.diff(pixels) == 0)) + 1

@@ -23,7 +23,7 @@ _LAST_CHUNK = b"IEND\xaeB`\x82"
 
 def display_image(output: RenderOutput) -> UInt8[np.ndarray, "h w 3"]:
     """Return sRGB over the background that was rendered, or over black if none was."""
-    return _quantized(output.color.detach().cpu().numpy())
+    return _to_uint8(output.color.detach().cpu().numpy())
 
 
 def over(output: RenderOutput, background: float) -> RenderOutput:
@@ -44,44 +44,47 @@ class PngSequence:
         return self.name
 
     @property
-    def together(self) -> bool:
+    def combines_cameras(self) -> bool:
         """Whether all cameras of a frame go into one file."""
         return False
 
     def check(self, cameras: Sequence[Camera]) -> None:
         """Accept any cameras."""
 
-    def write(self, pictures: Sequence[Picture], jobs: Sequence[str]) -> list[Path]:
-        """Write a frame's pictures; `jobs` are hashes of all that their files depend on."""
+    def write(self, pictures: Sequence[Picture], job_hashes: Sequence[str]) -> list[Path]:
+        """Write a frame's pictures; each file depends on all that its job's hash is of."""
         paths = [self._path(picture.frame, picture.camera.name) for picture in pictures]
-        for path, picture, job in zip(paths, pictures, jobs, strict=True):
-            write_png(crop_overscan(picture), path, job=job)
+        for path, picture, job_hash in zip(paths, pictures, job_hashes, strict=True):
+            write_png(crop_overscan(picture), path, job_hash=job_hash)
         return paths
 
-    def complete(self, frame: int, cameras: Sequence[str], jobs: Sequence[str], deep: bool) -> bool:
+    def is_complete(self, frame: int, cameras: Sequence[str], job_hashes: Sequence[str], deep: bool) -> bool:
         """Return whether a frame's files are there, whole, and from these very jobs; none is ever deep."""
-        return all(_is_of(self._path(frame, camera), job) for camera, job in zip(cameras, jobs, strict=True))
+        return all(
+            _comes_from(self._path(frame, camera), job_hash)
+            for camera, job_hash in zip(cameras, job_hashes, strict=True)
+        )
 
     def _path(self, frame: int, camera: str) -> Path:
         return self.folder / camera / f"{self.name}.{camera}.{frame:04d}.png"
 
 
-def write_png(output: RenderOutput, path: Path, *, job: str = "") -> Path:
+def write_png(output: RenderOutput, path: Path, *, job_hash: str = "") -> Path:
     """Write an 8-bit sRGB PNG with straight (not premultiplied) alpha and return its path.
 
     Args:
         output: Rendered without a background.
         path: The file, which appears when it is complete; folders are made if missing.
-        job: Written into the file, if given.
+        job_hash: Written into the file, if given.
     """
     text = PngInfo()
-    if job:
-        text.add_text(_JOB, job)
+    if job_hash:
+        text.add_text(_JOB, job_hash)
     color, alpha = output.color.detach().cpu().numpy(), output.alpha.detach().cpu().numpy()
     coverage = alpha[..., None]
     straight = np.divide(color, coverage, out=np.zeros_like(color), where=coverage >= _MIN_ALPHA)
     with atomic_write(path) as draft:
-        Image.fromarray(_quantized(np.concatenate([straight, coverage], -1))).save(
+        Image.fromarray(_to_uint8(np.concatenate([straight, coverage], -1))).save(
             draft, format="PNG", pnginfo=text
         )
     return path
@@ -99,7 +102,7 @@ def crop_overscan(picture: Picture) -> RenderOutput:
     return dataclasses.replace(output, **{name: image[inside, inside] for name, image in images.items()})
 
 
-def _is_of(path: Path, job: str) -> bool:
+def _comes_from(path: Path, job_hash: str) -> bool:
     """Return whether a PNG is whole and comes from a job."""
     try:
         # Readers do without the last chunk.
@@ -107,11 +110,11 @@ def _is_of(path: Path, job: str) -> bool:
             return False
         with Image.open(path) as image:
             image.load()
-            return image.info.get(_JOB) == job
+            return image.info.get(_JOB) == job_hash
     except (OSError, UnidentifiedImageError, SyntaxError):
         return False
 
 
-def _quantized(values: Float[np.ndarray, "h w c"]) -> UInt8[np.ndarray, "h w c"]:
+def _to_uint8(values: Float[np.ndarray, "h w c"]) -> UInt8[np.ndarray, "h w c"]:
     """Return values of 0..1 as 0..255, rounded to nearest."""
     return (values.clip(0, 1) * 255 + 0.5).astype(np.uint8)

@@ -25,11 +25,11 @@ _SIDED = ("arm", "hand", "leg", "foot")
 
 @dataclass(frozen=True)
 class Labels:
-    """To which of some named parts each Gaussian belongs."""
+    """Which part of the body, by name, each Gaussian belongs to."""
 
     names: tuple[str, ...]
-    of: UInt8[np.ndarray, " n"]
-    """Their indices."""
+    indices: UInt8[np.ndarray, " n"]
+    """Of each Gaussian's part in `names`."""
 
 
 def label_sequence(sequence: GaussianSequence) -> Labels:
@@ -40,8 +40,8 @@ def label_sequence(sequence: GaussianSequence) -> Labels:
     """
     if sequence.binding is None:
         raise ConfigError("--aov crypto: expected Gaussians bound to a body, found none; leave crypto out")
-    names, of = label_parts(sequence.binding)
-    return Labels(names, of.numpy().astype(np.uint8))
+    names, indices = label_parts(sequence.binding)
+    return Labels(names, indices.numpy().astype(np.uint8))
 
 
 def label_parts(binding: Binding) -> tuple[tuple[str, ...], Int[Tensor, " n"]]:

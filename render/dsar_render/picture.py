@@ -17,7 +17,7 @@ from dsar.errors import ConfigError
 from dsar.geometry.camera_paths import CameraPath
 from dsar.raster import Output, rasterize
 from dsar.types import Camera, Picture, RenderOutput
-from dsar_render.aovs import AOVS, RASTER_OUTPUTS, Moment, cover, make_aovs
+from dsar_render.aovs import AOVS, RASTER_OUTPUTS, TimeSample, make_aovs, part_coverage
 from dsar_render.deep import sample_deep
 from dsar_render.labels import Labels
 from dsar_render.triplets import FrameTriplet
@@ -112,22 +112,23 @@ def render_picture(
         provenance: Written into files of the picture.
     """
     view = path.at(triplet.frame)
-    now = Moment(triplet.now, _widened(view, settings.overscan))
-    wanted = set(settings.aovs)
-    raster_outputs: list[Output] = [output for name, output in RASTER_OUTPUTS.items() if name in wanted]
+    current = TimeSample(triplet.current, _with_overscan(view, settings.overscan))
+    names = set(settings.aovs)
+    raster_outputs: list[Output] = [output for name, output in RASTER_OUTPUTS.items() if name in names]
     if settings.deep:
         raster_outputs.append("contributors")
     deep = None
     with torch.no_grad():
-        output = rasterize(now.gaussians, now.camera, outputs=raster_outputs)
-        before, after = (_moment(triplet, path, step, settings.overscan) for step in (-1, 1))
-        aovs = make_aovs(wanted, output, now, before, after, labels)
+        output = rasterize(current.gaussians, current.camera, outputs=raster_outputs)
+        previous, following = (_neighbour(triplet, path, step, settings.overscan) for step in (-1, 1))
+        aovs = make_aovs(names, output, current, previous, following, labels)
         if settings.deep:
-            most = settings.deep_max_samples
-            deep = sample_deep(output, now.gaussians, now.camera, max_samples=most)
+            deep = sample_deep(
+                output, current.gaussians, current.camera, max_samples=settings.deep_max_samples
+            )
         if settings.times != [0.0]:
-            moments = [_shifted(triplet, path, time, settings.overscan) for time in settings.times]
-            output, coverage = _exposed(output, moments, labels if "crypto" in wanted else None)
+            samples = [_shutter_sample(triplet, path, time, settings.overscan) for time in settings.times]
+            output, coverage = _average_exposure(output, samples, labels if "crypto" in names else None)
             aovs = dataclasses.replace(aovs, coverage=coverage)
     return Picture(
         frame=triplet.frame,
@@ -152,7 +153,7 @@ def hash_job(
         path: The camera.
         settings: What is rendered.
         provenance: Where the Gaussians come from, to the checkpoint's and the motion's own hashes.
-        writer: What the file's writer was told.
+        writer: The settings of the file's writer, its `key`.
     """
     views = [path.at(frame + step) for step in (-1, 0, 1)]
     facts = {
@@ -171,46 +172,46 @@ def _version() -> str:
     return importlib.metadata.version("dsar-avatar")
 
 
-def _widened(camera: Camera, overscan: int) -> Camera:
+def _with_overscan(camera: Camera, overscan: int) -> Camera:
     """Return the camera with an image that is larger on all sides."""
     size = camera.width + 2 * overscan, camera.height + 2 * overscan
     return camera.cropped(-overscan, -overscan, *size) if overscan else camera
 
 
-def _moment(triplet: FrameTriplet, path: CameraPath, step: int, overscan: int) -> Moment | None:
+def _neighbour(triplet: FrameTriplet, path: CameraPath, step: int, overscan: int) -> TimeSample | None:
     """Return the frame before or after, None where there is none."""
-    gaussians = triplet.after if step > 0 else triplet.before
+    gaussians = triplet.following if step > 0 else triplet.previous
     if gaussians is None:
         return None
-    return Moment(gaussians, _widened(path.at(triplet.frame + step), overscan))
+    return TimeSample(gaussians, _with_overscan(path.at(triplet.frame + step), overscan))
 
 
-def _shifted(triplet: FrameTriplet, path: CameraPath, time: float, overscan: int) -> Moment:
-    """Return a time within the frame."""
-    return Moment(triplet.at(time), _widened(path.at(triplet.frame + time), overscan))
+def _shutter_sample(triplet: FrameTriplet, path: CameraPath, time: float, overscan: int) -> TimeSample:
+    """Return the scene at a time within the frame, in frames from its own."""
+    return TimeSample(triplet.interpolate(time), _with_overscan(path.at(triplet.frame + time), overscan))
 
 
-def _exposed(
-    sharp: RenderOutput, moments: list[Moment], labels: Labels | None
+def _average_exposure(
+    unblurred: RenderOutput, samples: list[TimeSample], labels: Labels | None
 ) -> tuple[RenderOutput, dict[str, torch.Tensor]]:
-    """Return the image with the mean light and coverage of some moments, and the mean coverage of parts."""
-    light, alpha = np.zeros(sharp.color.shape, np.float32), torch.zeros_like(sharp.alpha)
+    """Return the image with the samples' mean light and coverage, and the mean coverage of parts."""
+    light, alpha = np.zeros(unblurred.color.shape, np.float32), torch.zeros_like(unblurred.alpha)
     coverage: dict[str, torch.Tensor] = {}
-    for moment in moments:
-        found = rasterize(moment.gaussians, moment.camera)
-        share = 1 / len(moments)
-        light += _light(found) * np.float32(share)
-        alpha += found.alpha * share
+    for sample in samples:
+        image = rasterize(sample.gaussians, sample.camera)
+        weight = 1 / len(samples)
+        light += _linear_light(image) * np.float32(weight)
+        alpha += image.alpha * weight
         if labels is not None:
-            parts = cover(moment, labels)
-            coverage = {name: coverage.get(name, 0) + part * share for name, part in parts.items()}
+            parts = part_coverage(sample, labels)
+            coverage = {name: coverage.get(name, 0) + part * weight for name, part in parts.items()}
     covered = alpha[..., None].numpy()
     straight = np.divide(light, covered, out=np.zeros_like(light), where=covered > _MIN_ALPHA)
     color = torch.from_numpy(srgb_from_linear(straight) * covered)
-    return dataclasses.replace(sharp, color=color, alpha=alpha), coverage
+    return dataclasses.replace(unblurred, color=color, alpha=alpha), coverage
 
 
-def _light(output: RenderOutput) -> Float[np.ndarray, "h w 3"]:
+def _linear_light(output: RenderOutput) -> Float[np.ndarray, "h w 3"]:
     """Return the linear light of an image, premultiplied: what a film's exposure adds up."""
     covered, color = output.alpha[..., None].numpy(), output.color.numpy()
     straight = np.divide(color, covered, out=np.zeros_like(color), where=covered > _MIN_ALPHA)

@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dsar.errors import ConfigError
 from dsar.raster import rasterize
 from dsar.types import Camera, GaussianSequence, RenderOutput
+from dsar_render.camera_names import check_camera_names
 
 
 def render_sequence(
@@ -29,13 +29,7 @@ def render_sequence(
     Raises:
         ConfigError: There are no cameras, or two share a name and would overwrite each other's files.
     """
-    names = [camera.name for camera in cameras]
-    if not names:
-        raise ConfigError("render: expected at least one camera, found none: name one or pass all")
-    if doubled := {name for name in names if names.count(name) > 1}:
-        raise ConfigError(
-            f"render: expected distinct camera names, found {sorted(doubled)} twice: rename one"
-        )
+    check_camera_names([camera.name for camera in cameras])
     return _render_frames(sequence, cameras, background)
 
 

@@ -5,50 +5,23 @@ depend on nothing but its Gaussians and those of the frames beside it, so they a
 same wherever they are made.
 """
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
-from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import UInt8
 
-from dsar.errors import ConfigError
 from dsar.geometry.camera_paths import CameraPath
-from dsar.types import Camera, GaussianSequence, Picture
+from dsar.types import GaussianSequence
+from dsar_render.camera_names import check_camera_names
 from dsar_render.farm import run_tasks
 from dsar_render.images import crop_overscan, display_image, over
 from dsar_render.labels import Labels, label_sequence
 from dsar_render.picture import RenderSettings, hash_job, render_picture
 from dsar_render.triplets import FrameTriplet, iterate_triplets
+from dsar_render.writers import PictureWriter
 
 Image = UInt8[np.ndarray, "h w 3"]
-
-
-@runtime_checkable
-class PictureWriter(Protocol):
-    """A format, and where its files go."""
-
-    @property
-    def key(self) -> str:
-        """All settings that files depend on, besides their place."""
-        ...
-
-    @property
-    def together(self) -> bool:
-        """Whether all cameras of a frame go into one file."""
-        ...
-
-    def check(self, cameras: Sequence[Camera]) -> None:
-        """Raise a DsarError where cameras cannot be written together."""
-        ...
-
-    def write(self, pictures: Sequence[Picture], jobs: Sequence[str]) -> Any:
-        """Write a frame's pictures, all of them if `together`; `jobs` say what their files depend on."""
-        ...
-
-    def complete(self, frame: int, cameras: Sequence[str], jobs: Sequence[str], deep: bool) -> bool:
-        """Return whether a frame's files are there, whole, and from these very jobs."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -65,24 +38,18 @@ class Shot:
 
     def __post_init__(self) -> None:
         """Check that there are cameras, each with a name of its own."""
-        names = [path.name for path in self.paths]
-        if not names:
-            raise ConfigError("render: expected at least one camera, found none: name one or pass all")
-        if doubled := {name for name in names if names.count(name) > 1}:
-            raise ConfigError(
-                f"render: expected distinct camera names, found {sorted(doubled)} twice: rename one"
-            )
+        check_camera_names([path.name for path in self.paths])
 
-    def jobs(self, frame: int, provenance: dict[str, str], writer: PictureWriter) -> list[str]:
-        """Return the hash of each camera's file of a frame."""
+    def job_hashes(self, frame: int, provenance: dict[str, str], writer: PictureWriter) -> list[str]:
+        """Return the hash of all that each camera's file of a frame depends on."""
         key = writer.key
         return [hash_job(frame, path, self.settings, provenance, key) for path in self.paths]
 
-    def complete(self, frame: int, provenance: dict[str, str]) -> bool:
+    def is_complete(self, frame: int, provenance: dict[str, str]) -> bool:
         """Return whether all files of a frame are there, whole, and from this very shot."""
         names = [path.name for path in self.paths]
         return all(
-            writer.complete(frame, names, self.jobs(frame, provenance, writer), self.settings.deep)
+            writer.is_complete(frame, names, self.job_hashes(frame, provenance, writer), self.settings.deep)
             for writer in self.writers
         )
 
@@ -112,15 +79,18 @@ def render_shot(
         RenderError: Workers died again and again.
     """
     labels = label_sequence(sequence) if "crypto" in shot.settings.aovs else None
-    facts = labels, sequence.fps, dict(sequence.provenance)
-    work = _Work(shot.writers, shot.settings, shot.previews, *facts)
+    work = _FrameWork(
+        shot.writers, shot.settings, shot.previews, labels, sequence.fps, dict(sequence.provenance)
+    )
     triplets = iterate_triplets(sequence, frames, neighbours=shot.settings.needs_neighbours)
-    tasks = (_Task(triplet, tuple(path.around(triplet.frame) for path in shot.paths)) for triplet in triplets)
+    tasks = (
+        _FrameTask(triplet, tuple(path.around(triplet.frame) for path in shot.paths)) for triplet in triplets
+    )
     return run_tasks(work, tasks, jobs=jobs, scheduler=scheduler)
 
 
 @dataclass(frozen=True)
-class _Task:
+class _FrameTask:
     """A frame to draw."""
 
     triplet: FrameTriplet
@@ -128,7 +98,7 @@ class _Task:
 
 
 @dataclass(frozen=True)
-class _Work:
+class _FrameWork:
     """Draws and writes a frame; the same for every task."""
 
     writers: tuple[PictureWriter, ...]
@@ -138,17 +108,23 @@ class _Work:
     fps: float
     provenance: dict[str, str]
 
-    def __call__(self, task: _Task) -> tuple[int, Image | None]:
+    def __call__(self, task: _FrameTask) -> tuple[int, Image | None]:
         """Return the frame's number, and its preview."""
-        views = [view for paths in self._batches(task.paths) for view in self._shoot(task.triplet, paths)]
+        views = [
+            view for paths in self._batches(task.paths) for view in self._write_views(task.triplet, paths)
+        ]
         return task.triplet.frame, np.concatenate(views, 1) if views else None
 
     def _batches(self, paths: tuple[CameraPath, ...]) -> list[tuple[CameraPath, ...]]:
-        """Return which cameras' pictures are in memory at a time: one, unless they share a file."""
-        return [paths] if any(writer.together for writer in self.writers) else [(path,) for path in paths]
+        """Return which cameras' pictures are in memory at a time: one, unless cameras share a file."""
+        return (
+            [paths]
+            if any(writer.combines_cameras for writer in self.writers)
+            else [(path,) for path in paths]
+        )
 
-    def _shoot(self, triplet: FrameTriplet, paths: tuple[CameraPath, ...]) -> list[Image]:
-        """Write what some cameras see, and return their previews, if these are wanted."""
+    def _write_views(self, triplet: FrameTriplet, paths: tuple[CameraPath, ...]) -> list[Image]:
+        """Write what these cameras see, and return their previews, if the shot has any."""
         labels, fps, provenance = self.labels, self.fps, self.provenance
         pictures = [
             render_picture(triplet, path, self.settings, labels=labels, fps=fps, provenance=provenance)
@@ -156,7 +132,7 @@ class _Work:
         ]
         shot = Shot(paths, self.writers, self.settings)
         for writer in self.writers:
-            writer.write(pictures, shot.jobs(triplet.frame, provenance, writer))
+            writer.write(pictures, shot.job_hashes(triplet.frame, provenance, writer))
         if not self.previews:
             return []
-        return [display_image(over(crop_overscan(each), 1.0)) for each in pictures]
+        return [display_image(over(crop_overscan(picture), 1.0)) for picture in pictures]

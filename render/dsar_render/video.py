@@ -66,7 +66,7 @@ def _feed(
     for image in images:
         if image.shape != shape:
             raise ExportError(f"video: expected images of {shape}, found {image.shape}: render one size")
-        encoder.stdin.write(_even(image).tobytes())
+        encoder.stdin.write(_pad_to_even(image).tobytes())
 
 
 def _find_ffmpeg() -> str:
@@ -78,7 +78,7 @@ def _find_ffmpeg() -> str:
 
 
 def _encoder_arguments(image: UInt8[np.ndarray, "h w 3"], path: Path, fps: float) -> list[str]:
-    height, width = _even(image).shape[:2]
+    height, width = _pad_to_even(image).shape[:2]
     source = f"-f rawvideo -pixel_format rgb24 -video_size {width}x{height} -framerate {exact_rate(fps)}"
     # Without an explicit matrix ffmpeg converts by BT.601 and players decode by BT.709.
     convert = "scale=out_color_matrix=bt709:out_range=tv,format=yuv420p"
@@ -89,7 +89,7 @@ def _encoder_arguments(image: UInt8[np.ndarray, "h w 3"], path: Path, fps: float
     return [*options.split(), "-f", "mp4", str(path)]
 
 
-def _even(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
+def _pad_to_even(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
     """Return the image with even height and width, which 4:2:0 needs."""
     height, width = image.shape[:2]
     return np.pad(image, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")

@@ -103,7 +103,7 @@ def test_a_skinned_body_is_where_its_motion_has_it_at_that_time(skinned, fps):
         assert (gaussians.means - expected).norm(dim=1).max() < 2e-5
     # What a line between posed frames would make of it.
     (_, first), (_, second) = itertools.islice(roll_out(skinned, motion), 2)
-    chord = FrameTriplet(1001, first, after=second).at(0.5).means
+    chord = FrameTriplet(1001, first, following=second).interpolate(0.5).means
     assert (chord - skin(skinned, spin(60.0))[1]).norm(dim=1).max() > 0.01
 
 

@@ -81,14 +81,14 @@ def test_unfamiliar_poses_become_familiar_ones_once_trained():
     # Motion of many joints needs more than ten components, but not many more.
     assert (near - raw)[:, :3].square().mean() < 0.02 * raw[:, :3].square().mean()
     assert torch.equal(near[:, 3:], raw[:, 3:])
-    statistics = avatar.statistics
+    statistics, poses = avatar.statistics, avatar.principal_poses
 
     def deviations(maps: torch.Tensor) -> torch.Tensor:
         """Return how far poses are from the mean of training along its components, in standard deviations."""
         values = maps[:, :3].flatten(2)[:, :, avatar.control.cells]
         points = values * statistics.map_scale[:3, 0] + statistics.map_mean[:3, 0]
-        coefficients = (points.flatten(1) - statistics.pose_mean) @ statistics.pose_basis.mT
-        return coefficients.abs() / statistics.pose_deviation
+        coefficients = (points.flatten(1) - poses.mean) @ poses.basis.mT
+        return coefficients.abs() / poses.deviation
 
     assert deviations(wild).max() > 2
     assert deviations(tame).max() < 2.01

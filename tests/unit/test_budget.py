@@ -7,7 +7,7 @@ import torch
 
 from dsar.config import PRESETS, ModelConfig, ScheduleConfig, TrainConfig
 from dsar.errors import ConfigError
-from dsar.network import DualStreamNetwork
+from dsar.network import build_network
 from dsar.training import budget
 
 SMALL = TrainConfig(
@@ -20,7 +20,7 @@ SMALL = TrainConfig(
 def test_activations_are_those_that_a_real_step_keeps(wiring):
     config = dataclasses.replace(SMALL, model=dataclasses.replace(SMALL.model, wiring=wiring))
     size = budget.map_size(config)
-    network = DualStreamNetwork(config.model, torch.ones(size, dtype=torch.bool))
+    network = build_network(config.model, torch.ones(size, dtype=torch.bool))
     state = network.initial_state(3)
     state = dataclasses.replace(state, fresh=torch.zeros(3, dtype=torch.bool))
     maps, magnitude = torch.randn(3, config.model.map_channels, *size), torch.rand(3, 1, *size)

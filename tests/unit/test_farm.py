@@ -16,8 +16,9 @@ import pytest
 import torch
 
 from dsar.errors import ConfigError, MissingDependencyError, RenderError
-from dsar_render import farm
-from dsar_render.farm import run_tasks
+from dsar_render.farm import cluster_workers, run_tasks, scheduling
+from dsar_render.farm.local_workers import ProcessWorkers
+from dsar_render.farm.transport import pack
 
 TESTS = Path(farm_work.__file__).parent
 COUNT = 12
@@ -72,11 +73,11 @@ def course(tmp_path_factory):
             ahead.append(drawn - len(farm_work.ended(folder)))
             yield task
 
-    farm._logger.addHandler(handler)
+    scheduling._logger.addHandler(handler)
     try:
         results = list(run_tasks(farm_work.measure_or_die, counted(), jobs=2))
     finally:
-        farm._logger.removeHandler(handler)
+        scheduling._logger.removeHandler(handler)
     return Course(results, ahead, farm_work.ended(folder), warnings)
 
 
@@ -124,7 +125,7 @@ def test_a_worker_that_dies_on_a_cluster_costs_no_result(cluster, tmp_path):
     ids=["transposed", "expanded", "integers", "empty", "scalar", "with gradient", "parameter"],
 )
 def test_tensors_travel_as_they_are(tensor):
-    found = pickle.loads(farm._packed({"values": tensor}))["values"]
+    found = pickle.loads(pack({"values": tensor}))["values"]
     assert type(found) is type(tensor)
     same = ((each.dtype, each.shape, each.requires_grad) for each in (found, tensor))
     assert next(same) == next(same)
@@ -216,7 +217,7 @@ def test_an_iterator_that_is_closed_or_interrupted_finishes_what_is_in_hand():
 def test_a_task_that_kills_three_workers_is_given_up(tmp_path):
     with pytest.raises(RenderError, match=r"died 3 times .* give fewer --jobs"):
         # One worker, because it is their start that takes time.
-        list(farm._in_order(partial(farm._Processes, 1), farm_work.die, farm_work.tasks(tmp_path, 1)))
+        list(scheduling.run_in_order(partial(ProcessWorkers, 1), farm_work.die, farm_work.tasks(tmp_path, 1)))
     assert (tmp_path / "deaths").read_text() == "xxx"
 
 
@@ -260,7 +261,7 @@ def test_flags_that_cannot_be_followed_are_refused_before_any_work(flags, messag
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "no address at all"])
 def test_a_scheduler_that_does_not_answer_is_named(monkeypatch, address):
-    monkeypatch.setattr(farm, "_ANSWER_S", 0.5)
+    monkeypatch.setattr(cluster_workers, "_TIMEOUT_S", 0.5)
     with pytest.raises(ConfigError, match=rf"--scheduler {address}: no Dask scheduler answers"):
         next(run_tasks(farm_work.sum_up, [torch.zeros(1)], scheduler=address))
 
@@ -268,7 +269,7 @@ def test_a_scheduler_that_does_not_answer_is_named(monkeypatch, address):
 def test_a_cluster_whose_workers_lack_dsar_is_refused():
     answers = {"tcp://a": None, "tcp://b": ModuleNotFoundError("No module named 'dsar_render'")}
     with pytest.raises(ConfigError, match=r"1 of 2 workers .* install dsar-avatar .*tcp://b: No module"):
-        farm._check_workers("tcp://farm:8786", answers)
+        cluster_workers.check_workers("tcp://farm:8786", answers)
 
 
 def test_without_distributed_a_scheduler_names_the_extra(monkeypatch):

@@ -6,7 +6,7 @@ import torch
 
 from dsar.errors import ConfigError
 from dsar.evaluation.frechet import frechet_distance, i3d_features, load_i3d, slice_features
-from dsar.training.lpips import Lpips
+from dsar.metrics.lpips import Lpips
 
 
 def film(frames: int = 32, speed: int = 2) -> np.ndarray:

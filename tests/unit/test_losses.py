@@ -6,6 +6,7 @@ import torch
 from scipy.ndimage import gaussian_filter
 
 from dsar.config import LossConfig
+from dsar.metrics.images import ssim
 from dsar.network import NetworkOutput
 from dsar.training.fused_loss import fused_image_loss
 from dsar.training.losses import (
@@ -14,7 +15,6 @@ from dsar.training.losses import (
     pyramid_l1,
     registered_loss,
     spatial_loss,
-    ssim,
     temporal_losses,
 )
 

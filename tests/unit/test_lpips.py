@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from dsar.errors import ConfigError, DsarError
-from dsar.training.lpips import Lpips, find_lpips_weights, load_lpips
+from dsar.metrics.lpips import Lpips, find_lpips_weights, load_lpips
 from tools.fetch_lpips import ArrayUnpickler, convert_checkpoint
 
 NETS = ("alex", "vgg")

@@ -1,48 +1,15 @@
-"""The network against its literal definition, and what must hold of any autoregression."""
+"""What must hold of any autoregression, and of each ablation."""
 
 import dataclasses
 
 import pytest
 import torch
-from literal_network import LiteralNetwork, LiteralRollout
-
-from dsar.config import ModelConfig
-from dsar.network import STREAMS, DualStreamNetwork, NetworkState
-from dsar.network.session import InferenceSession
-
-SMALL = ModelConfig(window=4, memory=3, channels=(4, 8), heads=2, uv_feature_channels=2)
-SIZE = (8, 12)
+from networks import SMALL, WIRINGS, build, inputs, roll
 
 
-@pytest.fixture(params=["perframe", "late", "shared"])
+@pytest.fixture(params=WIRINGS)
 def wiring(request):
     return request.param
-
-
-def build(config: ModelConfig, *, trained: bool = True) -> DualStreamNetwork:
-    torch.manual_seed(0)
-    occupied = torch.ones(SIZE, dtype=torch.bool)
-    occupied[0, :2] = False
-    network = DualStreamNetwork(config, occupied)
-    if trained:
-        torch.nn.init.normal_(network.decoder.head.weight, std=0.1)
-    return network
-
-
-def inputs(config: ModelConfig, frames: int, batch: int = 2) -> tuple[torch.Tensor, torch.Tensor]:
-    generator = torch.Generator().manual_seed(1)
-    maps = torch.randn(frames, batch, config.map_channels, *SIZE, generator=generator)
-    speed = torch.rand(frames, batch, 1, *SIZE, generator=generator)
-    return maps, speed
-
-
-def roll(network, maps, speed, state: NetworkState | None = None, **options):
-    state = state or network.initial_state(maps.shape[1])
-    outputs = []
-    for frame in range(len(maps)):
-        output, state = network(maps[frame], speed[frame], state, **options)
-        outputs.append(output)
-    return outputs, state
 
 
 def test_an_untrained_network_leaves_the_template_alone(wiring):
@@ -136,40 +103,6 @@ def test_offsets_stay_inside_the_guard_and_outside_charts_are_zero(wiring):
     assert offset[:, :, 0, :2].abs().max() == 0
 
 
-VARIANTS = {
-    "paper": {},
-    "three offsets": {"feedback": 3},
-    "no offsets": {"feedback": 0},
-    "no bank": {"memory": 0},
-    "bank of features": {"bank": "features", "memory": 1},
-    "mean of rows": {"readout": "mean"},
-    "bidirectional": {"readout": "mean", "causal": False},
-    "no motion embedding": {"motion_embedding": False},
-    "no identities": {"uv_feature_channels": 0},
-    "pixel shuffle": {"pixel_shuffle": 2},
-    "one frame": {"window": 1},
-}
-
-
-@pytest.mark.parametrize("variant", VARIANTS)
-def test_what_is_saved_changes_nothing(wiring, variant):
-    """A literal reading, training's steps and a session's agree, beyond the window and the bank."""
-    config = dataclasses.replace(SMALL, wiring=wiring, **VARIANTS[variant])
-    network = build(config).double()
-    literal = LiteralNetwork(network)
-    maps, speed = (x.double() for x in inputs(config, 9))
-    with torch.no_grad():
-        trained, _ = roll(network, maps, speed)
-        slow, fast = LiteralRollout(literal), InferenceSession(network)
-        for frame, expected in enumerate(trained):
-            read = slow.step(maps[frame], speed[frame])
-            kept = fast.step(maps[frame], speed[frame])
-            for output in (read, kept):
-                assert (output.offset - expected.offset).norm() <= 1e-9 * expected.offset.norm()
-                assert (output.appearance - expected.appearance).norm() <= 1e-9 * expected.appearance.norm()
-    assert expected.offset.abs().max() > 1e-3
-
-
 ABLATIONS = {
     # What changes, and whose parameters come, go or change their size with it.
     "without GeoStream": ({"feedback": 0}, {"encoder.pyramid.first.weight"}),
@@ -236,84 +169,8 @@ def test_an_ablation_changes_its_part_and_the_output(name):
         assert torch.allclose(blind[-1].offset, two[-1].offset, atol=1e-6)
 
 
-@pytest.mark.parametrize("changes", [{"bases": 4}, {"channels": (8,)}], ids=["bases", "one level"])
-def test_rollouts_of_the_smallest_networks_are_those_of_training(changes):
-    config = dataclasses.replace(SMALL, **changes)
-    network, (maps, speed) = build(config).double(), (x.double() for x in inputs(config, 8))
-    expected, _ = roll(network, maps, speed)
-    session = InferenceSession(network)
-    for frame, output in enumerate(expected):
-        made = session.step(maps[frame], speed[frame])
-        assert torch.allclose(made.offset, output.offset, atol=1e-12)
-        assert torch.allclose(made.appearance, output.appearance, atol=1e-12)
-    assert expected[-1].offset.abs().max() > 1e-3
-
-
 def test_rows_that_see_the_future_differ_from_causal_ones():
     causal = dataclasses.replace(SMALL, readout="mean")
     free = dataclasses.replace(causal, causal=False)
     outputs = [roll(build(config), *inputs(SMALL, 8))[0][-1].offset for config in (causal, free)]
     assert (outputs[0] - outputs[1]).abs().max() > 1e-6
-
-
-@pytest.mark.parametrize("stream", STREAMS)
-def test_a_stream_taken_away_in_a_rollout_is_one_that_training_leaves_out(wiring, stream):
-    config = dataclasses.replace(SMALL, wiring=wiring)
-    network, (maps, speed) = build(config).double(), (x.double() for x in inputs(config, 8))
-    both, rest = (
-        InferenceSession(network),
-        InferenceSession(network, tuple(s for s in STREAMS if s != stream)),
-    )
-    outputs = [
-        [session.step(m, v).offset for m, v in zip(maps, speed, strict=True)] for session in (both, rest)
-    ]
-    without, _ = roll(network, maps, speed, streams=rest.streams)
-    for alone, trained in zip(outputs[1], without, strict=True):
-        assert torch.allclose(alone, trained.offset, atol=1e-12)
-    assert (outputs[0][-1] - outputs[1][-1]).abs().max() > 1e-6
-
-
-def test_sixteen_bits_are_enough_for_a_rollout():
-    network, (maps, speed) = build(SMALL), inputs(SMALL, 40)
-    exact, short = InferenceSession(network), InferenceSession(network, precision=torch.bfloat16)
-    error, size = 0.0, 0.0
-    for m, v in zip(maps, speed, strict=True):
-        one, other = exact.step(m, v).offset, short.step(m, v).offset
-        assert other.dtype == torch.float32
-        error, size = error + float((one - other).square().sum()), size + float(one.square().sum())
-    assert error < 0.02**2 * size
-    assert network.decoder.head.weight.dtype == torch.float32
-
-
-@pytest.mark.gpu
-@pytest.mark.parametrize("variant", ["paper", "mean of rows", "no bank"])
-def test_a_recorded_rollout_is_the_one_of_the_cpu(wiring, variant):
-    """One CUDA graph is replayed for all steps after the first, wherever in the rings the newest frame is."""
-    config = dataclasses.replace(SMALL, wiring=wiring, **VARIANTS[variant])
-    network, (maps, speed) = build(config), inputs(config, 20)
-    slow, recorded = InferenceSession(network), InferenceSession(network.cuda())
-    for m, v in zip(maps, speed, strict=True):
-        expected, found = slow.step(m, v).offset, recorded.step(m.cuda(), v.cuda()).offset
-        assert torch.allclose(found.cpu(), expected, atol=1e-5)
-    assert recorded._graph is not None
-    assert expected.abs().max() > 1e-3
-
-
-def test_gradients_are_those_of_the_literal_reading(wiring):
-    """Over rollouts from their first frame on, through offsets, window and bank."""
-    config = dataclasses.replace(SMALL, wiring=wiring)
-    network = build(config).double()
-    literal = LiteralNetwork(network)
-    maps, speed = (x.double() for x in inputs(config, 6))
-    # Folded kernels are sums of the literal ones.
-    folded = {id(up.conv.weight) for up in network.decoder.ups}
-    parameters = [p for p in network.parameters() if id(p) not in folded]
-    weights = torch.randn(6, 2, 3, *SIZE, generator=torch.Generator().manual_seed(5)).double()
-    rollout = LiteralRollout(literal)
-    read = [rollout.step(*frame) for frame in zip(maps, speed, strict=True)]
-    gradients = []
-    for outputs in (roll(network, maps, speed)[0], read):
-        loss = (torch.stack([output.offset for output in outputs]) * weights).sum()
-        gradients.append(torch.autograd.grad(loss, parameters))
-    for fast, slow in zip(*gradients, strict=True):
-        assert (fast - slow).norm() <= 1e-9 * slow.norm() + 1e-12

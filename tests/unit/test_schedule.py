@@ -1,11 +1,9 @@
 """Stages of training and the rollouts' cursors."""
 
 import numpy as np
-import pytest
 import torch
 
-from dsar.config import PRESETS, ScheduleConfig, TrainConfig, config_from_json, config_to_json
-from dsar.errors import ConfigError
+from dsar.config import ScheduleConfig
 from dsar.training.optimizers import set_rates
 from dsar.training.rollouts import RolloutBatch
 from dsar.training.schedule import WHOLE_CLIP, schedule_at
@@ -73,31 +71,3 @@ def test_a_whole_clip_starts_at_its_first_frame_and_is_seen_to_its_end():
     # Only the very first start is anywhere, so that several rollouts are out of step.
     first = seen[0]
     assert seen == ([*range(first, 10)] + [*range(3, 10)] * 2)[:14]
-
-
-@pytest.mark.parametrize("preset", PRESETS)
-def test_presets_are_consistent_and_survive_json(preset, tmp_path):
-    config = PRESETS[preset]
-    config.validate()
-    path = tmp_path / "config.json"
-    path.write_text(config_to_json(config))
-    assert config_from_json(path) == config
-
-
-def test_contradictory_settings_are_refused_before_any_work():
-    import dataclasses
-
-    config = TrainConfig()
-    atlas = dataclasses.replace(config.atlas, resolution=100)
-    model = dataclasses.replace(config.model, upsample=4)
-    with pytest.raises(ConfigError, match="multiple of 16"):
-        dataclasses.replace(config, atlas=atlas, model=model).validate()
-    with pytest.raises(ConfigError, match="heads"):
-        dataclasses.replace(config, model=dataclasses.replace(config.model, heads=5)).validate()
-
-
-def test_an_unreadable_config_says_which_file(tmp_path):
-    path = tmp_path / "config.json"
-    path.write_text('{"capture": "embedded", "unknown": 1}')
-    with pytest.raises(ConfigError, match=r"config\.json"):
-        config_from_json(path)

@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from dsar.data.captures.formats import open_capture
-from dsar.training.targets import MARGIN, load_target, mask_box
+from dsar.metrics.images import mask_box
+from dsar.training.targets import MARGIN, load_target
 
 
 @pytest.mark.parametrize("reduction", [1, 2, 3])

@@ -6,7 +6,8 @@ from pathlib import Path
 from dsar.errors import ExportError
 from dsar.types import Camera, Picture, RenderOutput
 from dsar_exporters.color import LINEAR_REC709, ColorTarget, ocio_config
-from dsar_exporters.exr.files import Compression, ExrSequence, Views, exr_path, write_parts
+from dsar_exporters.exr.parts import write_parts
+from dsar_exporters.exr.sequence import Compression, ExrSequence, Views, exr_path
 
 __all__ = ["ColorTarget", "Compression", "ExrSequence", "Views", "exr_path", "ocio_config", "write_exr"]
 

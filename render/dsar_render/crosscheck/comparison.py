@@ -24,7 +24,7 @@ from dsar_render.crosscheck.points import (
     project_spheres,
 )
 from dsar_render.crosscheck.proxies import Agreement, Hits, MitsubaScene, Shape
-from dsar_render.crosscheck.verdict import CameraAgreement, Image, SplatVerdict, Verdict
+from dsar_render.crosscheck.verdict import CameraVerdict, Image, SplatVerdict, Verdict
 
 Reporter = Callable[[str, float], None]
 
@@ -100,12 +100,12 @@ def seed_mistakes(mi: Any, camera: Camera) -> dict[str, str | None]:
     probe = Camera(K, _rolled(T, 0.2), width, height, "probe")
     observations = project_spheres(mi, probe)
     return {
-        each.name: find_fault(probe, observations, camera_projection(each.variants[0](probe)))
+        each.name: find_mistake(probe, observations, camera_projection(each.variants[0](probe)))
         for each in MISTAKES
     }
 
 
-def find_fault(camera: Camera, observations: SphereObservations, source: Projection) -> str | None:
+def find_mistake(camera: Camera, observations: SphereObservations, source: Projection) -> str | None:
     """Return the mistake that a projection has made, `unknown` if it is none of the usual; None if none.
 
     Args:
@@ -124,13 +124,13 @@ def find_fault(camera: Camera, observations: SphereObservations, source: Project
 
 def _judge(
     camera: Camera, observations: SphereObservations, sources: Mapping[str, Projection], proxy: Agreement
-) -> CameraAgreement:
+) -> CameraVerdict:
     residuals = {
         name: Residuals.from_distances(observations.residuals(source)) for name, source in sources.items()
     }
-    faults = {name: find_fault(camera, observations, source) for name, source in sources.items()}
+    faults = {name: find_mistake(camera, observations, source) for name, source in sources.items()}
     named = {name: fault for name, fault in faults.items() if fault is not None}
-    return CameraAgreement(camera.name, residuals, named, proxy)
+    return CameraVerdict(camera.name, residuals, named, proxy)
 
 
 def _compare_splats(

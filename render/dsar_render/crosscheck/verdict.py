@@ -23,7 +23,7 @@ _LEAST_CORRELATION = 0.95
 
 
 @dataclass(frozen=True)
-class CameraAgreement:
+class CameraVerdict:
     """One camera, seen by both."""
 
     name: str
@@ -87,7 +87,7 @@ class Verdict:
 
     variant: str
     """Of Mitsuba."""
-    cameras: tuple[CameraAgreement, ...]
+    cameras: tuple[CameraVerdict, ...]
     seeds: Mapping[str, str | None]
     """What a mistake that was made on purpose was taken for: its own name where it was caught."""
     splats: SplatVerdict | None

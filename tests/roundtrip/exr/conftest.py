@@ -26,8 +26,8 @@ def labels(figure) -> Labels:
     binding = figure.binding
     uv = binding.uv.clone()
     uv[binding.points[:, 0] < 0, 1] = -0.5
-    names, of = label_parts(dataclasses.replace(binding, uv=uv))
-    return Labels(names, of.numpy().astype(np.uint8))
+    names, indices = label_parts(dataclasses.replace(binding, uv=uv))
+    return Labels(names, indices.numpy().astype(np.uint8))
 
 
 @pytest.fixture(scope="module")

@@ -26,7 +26,7 @@ def written(request, picture, side, tmp_path) -> tuple[ExrSequence, list[Path]]:
 def complete(
     sequence: ExrSequence, *, frame=1003, cameras=("front", "side"), jobs=("job a", "job b"), deep=True
 ):
-    return sequence.complete(frame, cameras, jobs, deep)
+    return sequence.is_complete(frame, cameras, jobs, deep)
 
 
 def test_what_was_written_is_complete(written):

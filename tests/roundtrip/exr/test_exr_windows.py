@@ -149,4 +149,4 @@ def test_an_empty_picture_still_makes_readable_files(nothing, tmp_path, cropped,
     assert (spec.width, spec.height) == ((1, 1) if cropped else (192, 256))
     data = oiio.ImageBuf(str(deep)).deepdata()
     assert sum(data.samples(pixel) for pixel in range(spec.width * spec.height)) == 0
-    assert ExrSequence(tmp_path).complete(1003, ["front"], ["job of front"], True)
+    assert ExrSequence(tmp_path).is_complete(1003, ["front"], ["job of front"], True)

@@ -21,12 +21,12 @@ def test_pngs_are_complete_when_they_are_whole_and_of_this_job(picture, side, tm
         "side/anna.side.1003.png",
     ]
     jobs = ["job of front", "job of side"]
-    assert sequence.complete(1003, ["front", "side"], jobs, False)
-    assert sequence.complete(1003, ["front", "side"], jobs, True)
-    assert not sequence.complete(1003, ["front", "side"], jobs[::-1], False)
-    assert not sequence.complete(1004, ["front"], jobs[:1], False)
-    assert not sequence.complete(1003, ["back"], jobs[:1], False)
-    assert not PngSequence(tmp_path, "other").complete(1003, ["front"], jobs[:1], False)
+    assert sequence.is_complete(1003, ["front", "side"], jobs, False)
+    assert sequence.is_complete(1003, ["front", "side"], jobs, True)
+    assert not sequence.is_complete(1003, ["front", "side"], jobs[::-1], False)
+    assert not sequence.is_complete(1004, ["front"], jobs[:1], False)
+    assert not sequence.is_complete(1003, ["back"], jobs[:1], False)
+    assert not PngSequence(tmp_path, "other").is_complete(1003, ["front"], jobs[:1], False)
     assert sequence.key != PngSequence(tmp_path, "other").key
 
 
@@ -36,11 +36,11 @@ def test_a_png_that_is_cut_off_anywhere_is_noticed(picture, tmp_path):
     size = len(content)
     for length in (0, 1, 8, 33, 100, size // 4, size // 2, size - 500, size - 20, size - 12, size - 1):
         path.write_bytes(content[:length])
-        assert not sequence.complete(1003, ["front"], ["job of front"], False), (length, size)
+        assert not sequence.is_complete(1003, ["front"], ["job of front"], False), (length, size)
     path.write_bytes(b"nothing like it")
-    assert not sequence.complete(1003, ["front"], ["job of front"], False)
+    assert not sequence.is_complete(1003, ["front"], ["job of front"], False)
     path.write_bytes(content)
-    assert sequence.complete(1003, ["front"], ["job of front"], False)
+    assert sequence.is_complete(1003, ["front"], ["job of front"], False)
 
 
 def test_the_same_picture_makes_the_same_png(picture, tmp_path):

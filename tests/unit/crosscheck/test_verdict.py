@@ -9,14 +9,14 @@ from dsar_render.crosscheck.comparison import cross_check
 from dsar_render.crosscheck.points import Residuals
 from dsar_render.crosscheck.proxies import Agreement, Shape, ellipsoids
 from dsar_render.crosscheck.splats import Explanation
-from dsar_render.crosscheck.verdict import CameraAgreement, SplatVerdict, Verdict
+from dsar_render.crosscheck.verdict import CameraVerdict, SplatVerdict, Verdict
 
 NAN = math.nan
 SEEN, UNSEEN = Agreement(0.999, 1e-5, 1.0), Agreement(NAN, NAN, NAN)
 
 
-def camera(proxy: Agreement = SEEN, mistakes: dict[str, str] | None = None) -> CameraAgreement:
-    return CameraAgreement("cam0", {"ours": Residuals(0.01, 0.02)}, mistakes or {}, proxy)
+def camera(proxy: Agreement = SEEN, mistakes: dict[str, str] | None = None) -> CameraVerdict:
+    return CameraVerdict("cam0", {"ours": Residuals(0.01, 0.02)}, mistakes or {}, proxy)
 
 
 def splats(coverage=0.001, ours=1e-6, theirs=1e-3, correlation=0.99) -> SplatVerdict:
@@ -24,7 +24,7 @@ def splats(coverage=0.001, ours=1e-6, theirs=1e-3, correlation=0.99) -> SplatVer
     return SplatVerdict(31.0, coverage, {"cam0": explanation}, {"means": (correlation, 1.0)})
 
 
-def verdict(*cameras: CameraAgreement, splats: SplatVerdict | None = None, caught: bool = True) -> Verdict:
+def verdict(*cameras: CameraVerdict, splats: SplatVerdict | None = None, caught: bool = True) -> Verdict:
     seeds = {"flipped_y": "flipped_y" if caught else None}
     return Verdict("scalar_rgb", cameras or (camera(),), seeds, splats, {})
 

@@ -29,8 +29,8 @@ def middle(instants: list[FrameTriplet]) -> FrameTriplet:
 
 @pytest.fixture(scope="module")
 def labels(figure: GaussianSequence) -> Labels:
-    names, of = label_parts(figure.binding)
-    return Labels(names, of.numpy().astype(np.uint8))
+    names, indices = label_parts(figure.binding)
+    return Labels(names, indices.numpy().astype(np.uint8))
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +53,6 @@ def everything(middle: FrameTriplet, still: CameraPath, labels: Labels) -> Pictu
 
 @pytest.fixture(scope="module")
 def blended(middle: FrameTriplet, front: Camera) -> Contributors:
-    found = rasterize(middle.now, front, outputs=["contributors"]).contributors
+    found = rasterize(middle.current, front, outputs=["contributors"]).contributors
     assert found is not None
     return found

@@ -24,15 +24,15 @@ from dsar_render.triplets import FrameTriplet
 def test_blended_values_are_the_sum_over_contributors(middle, front, blended, channels):
     generator = torch.Generator().manual_seed(channels)
     offsets = torch.tensor([0.0, 40.0, -40.0, 3.0, -1.0, 0.0, 90.0])[:channels]
-    values = torch.randn(len(middle.now), channels, generator=generator) * 10 + offsets
-    found, expected = blend_values(middle.now, front, values), weighted_sum(blended, values)
+    values = torch.randn(len(middle.current), channels, generator=generator) * 10 + offsets
+    found, expected = blend_values(middle.current, front, values), weighted_sum(blended, values)
     assert (found - expected).abs().max() < 1e-6 * float(values.abs().max()) * 2
     assert not found[blended.counts == 0].any()
 
 
 def test_blended_ones_are_alpha(middle, front):
-    alpha = rasterize(middle.now, front).alpha
-    found = blend_values(middle.now, front, torch.ones(len(middle.now), 1))[..., 0]
+    alpha = rasterize(middle.current, front).alpha
+    found = blend_values(middle.current, front, torch.ones(len(middle.current), 1))[..., 0]
     torch.testing.assert_close(found, alpha, atol=1e-6, rtol=0)
 
 
@@ -40,14 +40,14 @@ def test_values_of_what_is_not_drawn_do_not_matter(middle, front):
     lost = dataclasses.replace(
         some(3), means=torch.tensor([[math.nan] * 3] * 3), harmonics=torch.zeros(3, 1, 3)
     )
-    values = torch.randn(len(middle.now), 4, generator=torch.Generator().manual_seed(0))
+    values = torch.randn(len(middle.current), 4, generator=torch.Generator().manual_seed(0))
     strange = torch.tensor([math.nan, math.inf, -math.inf])[:, None].expand(3, 4)
-    found = blend_values(joined(middle.now, lost), front, torch.cat([values, strange]))
-    torch.testing.assert_close(found, blend_values(middle.now, front, values), atol=1e-6, rtol=0)
+    found = blend_values(joined(middle.current, lost), front, torch.cat([values, strange]))
+    torch.testing.assert_close(found, blend_values(middle.current, front, values), atol=1e-6, rtol=0)
 
 
 def test_no_gaussians_blend_to_nothing(middle, front):
-    none = middle.now.map(lambda values: values[:0])
+    none = middle.current.map(lambda values: values[:0])
     assert not blend_values(none, front, torch.zeros(0, 4)).any()
 
 
@@ -85,7 +85,7 @@ def test_positions_lie_behind_their_pixels_centres_at_the_expected_depth(everyth
 
 
 def test_front_depth_and_heaviest_are_those_of_the_contributors(everything, middle, front, blended):
-    depth = project(front, middle.now.means)[1]
+    depth = project(front, middle.current.means)[1]
     ends = blended.counts.flatten().cumsum(0)
     for pixel, (end, count) in enumerate(zip(ends.tolist(), blended.counts.flatten().tolist(), strict=True)):
         nearest, heaviest = 0.0, -1

@@ -17,8 +17,8 @@ from dsar_render.picture import RenderSettings, render_picture
 
 @pytest.mark.parametrize("most", [1, 2, 4, 32])
 def test_deep_samples_flatten_to_the_picture(middle, front, most):
-    output = rasterize(middle.now, front, outputs=["contributors"])
-    deep = sample_deep(output, middle.now, front, max_samples=most)
+    output = rasterize(middle.current, front, outputs=["contributors"])
+    deep = sample_deep(output, middle.current, front, max_samples=most)
     counts = deep.counts.flatten()
     assert int(counts.max()) <= most
     assert torch.equal(deep.counts > 0, output.alpha > 0)
@@ -40,9 +40,9 @@ def test_deep_samples_flatten_to_the_picture(middle, front, most):
 
 @pytest.mark.parametrize("most", [1, 3, 32])
 def test_merged_samples_are_in_order_within_what_they_stand_for(middle, front, blended, most):
-    output = rasterize(middle.now, front, outputs=["contributors"])
-    deep = sample_deep(output, middle.now, front, max_samples=most)
-    depth = project(front, middle.now.means)[1]
+    output = rasterize(middle.current, front, outputs=["contributors"])
+    deep = sample_deep(output, middle.current, front, max_samples=most)
+    depth = project(front, middle.current.means)[1]
     ends, stops = deep.counts.flatten().cumsum(0), blended.counts.flatten().cumsum(0)
     for pixel in torch.nonzero(deep.counts.flatten()).flatten()[::37].tolist():
         merged = slice(int(ends[pixel] - deep.counts.flatten()[pixel]), int(ends[pixel]))
@@ -61,7 +61,7 @@ def test_merged_samples_are_in_order_within_what_they_stand_for(middle, front, b
 
 def test_depths_never_fall_where_rounding_would_have_them_fall(middle, front):
     # All on one plane but for their last digits, which the rasteriser rounds in its own way.
-    flat = slab(front, middle.now, 3.0)
+    flat = slab(front, middle.current, 3.0)
     output = rasterize(flat, front, outputs=["contributors"])
     own = project(front, flat.means)[1][output.contributors.ids].diff()
     assert (own < 0).any()

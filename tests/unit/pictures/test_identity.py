@@ -108,9 +108,9 @@ def test_a_picture_does_not_depend_on_the_number_of_threads(middle, moving, labe
 
 
 def test_a_picture_does_not_change_what_it_is_made_of(middle, still, labels):
-    before = [values.clone() for values in vars(middle.now).values()]
+    before = [values.clone() for values in vars(middle.current).values()]
     render_picture(middle, still, RenderSettings(AOVS, deep=True), labels=labels)
-    assert all(map(torch.equal, before, vars(middle.now).values()))
+    assert all(map(torch.equal, before, vars(middle.current).values()))
 
 
 def test_everything_follows_when_scene_and_camera_move_together(middle, moving, labels):
@@ -130,7 +130,7 @@ def test_everything_follows_when_scene_and_camera_move_together(middle, moving, 
             camera, T_camera_world=(camera.T_camera_world.double() @ T_world_new).float()
         )
 
-    elsewhere = FrameTriplet(middle.frame, *map(carried, (middle.now, middle.before, middle.after)))
+    elsewhere = FrameTriplet(middle.frame, *map(carried, (middle.current, middle.previous, middle.following)))
     path = dataclasses.replace(moving, cameras=tuple(map(followed, moving.cameras)))
     here = render_picture(middle, moving, RenderSettings(AOVS), labels=labels)
     there = render_picture(elsewhere, path, RenderSettings(AOVS), labels=labels)

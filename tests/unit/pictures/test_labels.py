@@ -23,9 +23,9 @@ def binding_of(figure, joints: tuple[str, ...], v: float = 0.5):
 
 
 def part_of_each(figure, joints: tuple[str, ...], v: float = 0.5) -> list[str]:
-    names, of = label_parts(binding_of(figure, joints, v))
+    names, indices = label_parts(binding_of(figure, joints, v))
     assert len(set(names)) == len(names)
-    return [names[index] for index in of]
+    return [names[index] for index in indices]
 
 
 def test_parts_of_the_body_have_the_names_that_an_artist_expects(figure):
@@ -71,7 +71,7 @@ def test_what_lies_below_the_bodys_chart_is_garment(figure):
 
 def test_left_and_right_hands_are_where_they_are(figure, labels):
     points = figure.binding.points
-    middle = {name: points[labels.of == index].mean(0) for index, name in enumerate(labels.names[:-1])}
+    middle = {name: points[labels.indices == index].mean(0) for index, name in enumerate(labels.names[:-1])}
     assert middle["left_hand"][0] > middle["left_arm"][0] > middle["torso"][0] > middle["right_arm"][0]
     assert middle["right_arm"][0] > middle["right_hand"][0]
     assert middle["head"][1] > middle["torso"][1] > middle["left_leg"][1] > middle["left_foot"][1]

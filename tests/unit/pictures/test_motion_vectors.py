@@ -67,7 +67,7 @@ def test_motion_vectors_lead_to_the_same_colours_in_the_frames_beside(instants, 
 
 
 def test_what_moves_parallel_to_the_image_moves_by_exactly_the_shift(front, still, middle):
-    flat = slab(front, middle.now, 3.0)
+    flat = slab(front, middle.current, 3.0)
     right, down = front.T_camera_world[0, :3], front.T_camera_world[1, :3]
     after, before = moved(flat, 0.03 * right + 0.01 * down), moved(flat, 0.02 * right)
     picture = render_picture(
@@ -85,7 +85,7 @@ def test_a_camera_that_goes_with_the_figure_sees_no_motion(front, middle):
     transform = front.T_camera_world.clone()
     transform[:3, 3] -= transform[:3, :3] @ offset
     follows = CameraPath((front, dataclasses.replace(front, T_camera_world=transform)), (1002, 1003))
-    triplet = FrameTriplet(1002, middle.now, after=moved(middle.now, offset))
+    triplet = FrameTriplet(1002, middle.current, following=moved(middle.current, offset))
     picture = render_picture(triplet, follows, RenderSettings(("motion",)))
     assert picture.aovs.forward.abs().max() < 1e-3
 
@@ -95,7 +95,7 @@ def test_a_still_scene_moves_as_the_camera_does(front, middle):
     turn = torch.eye(4)
     turn[:3, :3] = matrix_from_axis_angle(torch.tensor([0.0, 0.02, 0.0]))
     turned = dataclasses.replace(front, T_camera_world=turn @ front.T_camera_world)
-    triplet = FrameTriplet(1002, middle.now, after=middle.now)
+    triplet = FrameTriplet(1002, middle.current, following=middle.current)
     path = CameraPath((front, turned), (1002, 1003))
     picture = render_picture(triplet, path, RenderSettings(("rgba", "P", "motion")))
     solid = picture.output.alpha > 0.99
@@ -121,13 +121,13 @@ def test_what_passes_the_cameras_plane_leaves_other_vectors_alone(front, still, 
 
     def with_one(depth: float, side: float) -> Gaussians:
         # Beside the picture, at any depth: 0.3 times its depth is the picture's edge.
-        one = middle.now.map(lambda values: values[:1])
+        one = middle.current.map(lambda values: values[:1])
         place = front.center + forward * depth + right * side
-        return joined(middle.now, dataclasses.replace(one, means=place[None]))
+        return joined(middle.current, dataclasses.replace(one, means=place[None]))
 
     triplet = FrameTriplet(1002, with_one(depths[0], 0.9), None, with_one(depths[1], 1.0))
     found = render_picture(triplet, still, RenderSettings(("motion",))).aovs.forward
-    alone = FrameTriplet(1002, middle.now, None, middle.now)
+    alone = FrameTriplet(1002, middle.current, None, middle.current)
     assert not render_picture(alone, still, RenderSettings(("motion",))).aovs.forward.any()
     # At the faintest edges, whose sums are divided by an alpha of 1/255.
     assert found.abs().max() < 0.02

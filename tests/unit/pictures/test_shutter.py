@@ -42,7 +42,7 @@ def test_neighbours_are_needed_for_motion_and_for_other_times(settings, needed):
 
 
 def test_an_open_shutter_does_not_change_a_still_figure(middle, still, labels, everything):
-    alike = FrameTriplet(middle.frame, middle.now, middle.now, middle.now)
+    alike = FrameTriplet(middle.frame, middle.current, middle.current, middle.current)
     settings = RenderSettings(AOVS, motion_samples=5, shutter=(-0.5, 0.5))
     found, sharp = layers(render_picture(alike, still, settings, labels=labels)), layers(everything)
     for name in ("color", "alpha", *everything.aovs.coverage):
@@ -62,7 +62,7 @@ def test_alpha_and_light_are_means_of_the_moments_pictures(middle, camera, shutt
     path = request.getfixturevalue(camera)
     settings = RenderSettings(("rgba",), motion_samples=3, shutter=shutter)
     found = render_picture(middle, path, settings).output
-    moments = [rasterize(middle.at(time), path.at(middle.frame + time)) for time in settings.times]
+    moments = [rasterize(middle.interpolate(time), path.at(middle.frame + time)) for time in settings.times]
     alpha = torch.stack([each.alpha.double() for each in moments]).mean(0)
     assert (found.alpha - alpha).abs().max() < 1e-6
     expected = np.mean([light(each.color, each.alpha) for each in moments], 0)
@@ -112,7 +112,7 @@ def test_coverage_of_the_parts_sums_to_alpha(middle, still, labels, settings):
 
 
 def test_coverage_is_the_share_of_the_parts_own_gaussians(everything, blended, labels):
-    ones = torch.eye(len(labels.names))[torch.from_numpy(labels.of).long()]
+    ones = torch.eye(len(labels.names))[torch.from_numpy(labels.indices).long()]
     expected = weighted_sum(blended, ones)
     found = torch.stack(list(everything.aovs.coverage.values()), -1)
     assert (found - expected).abs().max() < 1e-6

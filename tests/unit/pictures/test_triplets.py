@@ -24,12 +24,12 @@ def three() -> FrameTriplet:
 
 
 def test_at_no_offset_the_frame_is_itself(three):
-    assert three.at(0.0) is three.now
+    assert three.interpolate(0.0) is three.current
 
 
-@pytest.mark.parametrize(("offset", "name"), [(-1.0, "before"), (1.0, "after")])
+@pytest.mark.parametrize(("offset", "name"), [(-1.0, "previous"), (1.0, "following")])
 def test_a_whole_frame_away_is_that_frame(three, offset, name):
-    found, expected = three.at(offset), getattr(three, name)
+    found, expected = three.interpolate(offset), getattr(three, name)
     for field in ("means", "scales", "opacities", "harmonics"):
         assert torch.equal(getattr(found, field), getattr(expected, field))
     # As rotations: a quaternion and its negative are one.
@@ -40,10 +40,10 @@ def test_a_whole_frame_away_is_that_frame(three, offset, name):
 
 @pytest.mark.parametrize("offset", [-0.75, -0.25, 0.125, 0.5])
 def test_between_frames_everything_but_rotations_changes_linearly(three, offset):
-    other = three.after if offset > 0 else three.before
-    found, share = three.at(offset), abs(offset)
+    other = three.following if offset > 0 else three.previous
+    found, share = three.interpolate(offset), abs(offset)
     for field in ("means", "scales", "opacities", "harmonics"):
-        start, end = getattr(three.now, field), getattr(other, field)
+        start, end = getattr(three.current, field), getattr(other, field)
         torch.testing.assert_close(getattr(found, field), (1 - share) * start + share * end)
     torch.testing.assert_close(found.rotations.norm(dim=-1), torch.ones(6))
 
@@ -59,11 +59,16 @@ def test_rotations_take_the_shorter_arc_whatever_their_signs(sign, degrees):
     now, after = (
         dataclasses.replace(some(), rotations=rotations) for rotations in (start.clone(), sign * end)
     )
-    found = FrameTriplet(1001, now, after=after)
+    found = FrameTriplet(1001, now, following=after)
     torch.testing.assert_close(
-        matrix_from_quaternion(found.at(0.5).rotations), matrix_from_quaternion(half), atol=1e-6, rtol=0
+        matrix_from_quaternion(found.interpolate(0.5).rotations),
+        matrix_from_quaternion(half),
+        atol=1e-6,
+        rtol=0,
     )
-    steps = [(found.at(share).rotations * end).sum(-1).abs() for share in (0.0, 0.25, 0.5, 0.75, 1.0)]
+    steps = [
+        (found.interpolate(share).rotations * end).sum(-1).abs() for share in (0.0, 0.25, 0.5, 0.75, 1.0)
+    ]
     assert all((later > earlier).all() for earlier, later in pairwise(steps))
 
 
@@ -73,20 +78,20 @@ def test_half_a_turn_ends_where_it_should():
         dataclasses.replace(some(1), rotations=torch.tensor([rotation]))
         for rotation in ([1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0])
     )
-    triplet = FrameTriplet(1001, now, after=after)
-    torch.testing.assert_close(triplet.at(1.0).rotations.abs(), after.rotations)
+    triplet = FrameTriplet(1001, now, following=after)
+    torch.testing.assert_close(triplet.interpolate(1.0).rotations.abs(), after.rotations)
     torch.testing.assert_close(
-        triplet.at(0.5).rotations.abs(), torch.tensor([[math.sqrt(0.5), 0, math.sqrt(0.5), 0]])
+        triplet.interpolate(0.5).rotations.abs(), torch.tensor([[math.sqrt(0.5), 0, math.sqrt(0.5), 0]])
     )
 
 
 @pytest.mark.parametrize(("triplet", "offset"), [("first", -0.5), ("last", 0.5), ("last", 1.0)])
 def test_beyond_the_ends_of_a_motion_everything_stands_still(triplet, offset):
     ends = {
-        "first": FrameTriplet(1, some(), after=some(seed=1)),
-        "last": FrameTriplet(1, some(), before=some(seed=1)),
+        "first": FrameTriplet(1, some(), following=some(seed=1)),
+        "last": FrameTriplet(1, some(), previous=some(seed=1)),
     }
-    assert ends[triplet].at(offset) is ends[triplet].now
+    assert ends[triplet].interpolate(offset) is ends[triplet].current
 
 
 def sequence(*numbers: int, made: list[int] | None = None) -> GaussianSequence:
@@ -106,8 +111,8 @@ def seeds(triplet: FrameTriplet) -> tuple[int, int | None, int | None]:
     def which(gaussians: Gaussians | None) -> int | None:
         return None if gaussians is None else known[float(gaussians.means[0, 0])]
 
-    assert which(triplet.now) == triplet.frame
-    return triplet.frame, which(triplet.before), which(triplet.after)
+    assert which(triplet.current) == triplet.frame
+    return triplet.frame, which(triplet.previous), which(triplet.following)
 
 
 def test_every_frame_comes_with_those_beside_it():
@@ -160,6 +165,11 @@ def test_instants_keep_no_graph_of_what_made_them():
             yield some(seed=number).map(Tensor.requires_grad_)
 
     found = list(iterate_triplets(GaussianSequence((1, 2), 24.0, 6, produce), {1, 2}))
-    held = [gaussians for each in found for gaussians in (each.now, each.before, each.after) if gaussians]
+    held = [
+        gaussians
+        for each in found
+        for gaussians in (each.current, each.previous, each.following)
+        if gaussians
+    ]
     assert len(held) == 4
     assert not any(values.requires_grad for gaussians in held for values in vars(gaussians).values())

@@ -1,21 +1,16 @@
-"""Every setting of a run, its unit and its default, and the presets.
+"""Every setting of a run: its meaning, its unit and its default.
 
-A run's config.json is exactly a `TrainConfig`. The preset `paper` holds the paper's values
-(section 4.1); fields marked *extension* have no counterpart there and are off in it.
+A run's config.json is exactly a `TrainConfig`. Settings marked *extension* have no counterpart in the paper.
 """
 
-import dataclasses
-import json
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any, Literal, TypeVar, cast, get_args, get_origin, get_type_hints
+from typing import Literal
 
 from dsar.errors import ConfigError
-from dsar.text import read_json
 
 EMBEDDED = "embedded"
 """Stands for the capture that comes with the package, in place of a folder."""
-T = TypeVar("T")
+PRESET_NAMES = ("demo", "small", "paper")
 
 
 @dataclass(frozen=True)
@@ -53,7 +48,7 @@ class ModelConfig:
     feedback: int = 1
     """Previous offsets fed back (the geometric stream; the paper: 1, in ablations 3 and 5); 0 removes it."""
     causal: bool = True
-    """Frames of the window attend to none that is younger. It matters for the readout `mean` only."""
+    """Frames of the window attend to no later frame. It matters for the readout `mean` only."""
     readout: Literal["last", "mean"] = "last"
     """What the window's attention hands on: the newest frame's row (the paper), or the mean of all rows."""
     velocity: bool = True
@@ -61,8 +56,8 @@ class ModelConfig:
     acceleration: bool = True
     """Feed acceleration maps (extension; it nearly halves the error of driven cloth)."""
     mean_time_constants: tuple[float, ...] = (0.1, 0.2, 0.4)
-    """Feed, for each of these times in seconds, how far a running mean of the motion lags behind it
-    (extension): a memory that nothing has to learn."""
+    """Time constants, seconds, of running means of the motion; for each, the way from the newest frame to
+    the mean is fed as a map (extension): a memory that nothing has to learn."""
     pose_components: int = 0
     """New poses are replaced by what so many principal components of the training poses say
     of them, each within two standard deviations (Li et al. 2024); 0: they are taken as they are."""
@@ -80,9 +75,9 @@ class ModelConfig:
     bases: int = 0
     """Fixed maps that the output is a mixture of, instead of the decoder's convolutions; 0: the decoder."""
     uv_feature_channels: int = 8
-    """Channels of a learnt static map that tells pixels apart (extension)."""
+    """Channels of learned UV features, a static map that tells pixels apart (extension)."""
     memory_weight: float = 0.5
-    """Initial lambda: the share of the memory in the hidden state."""
+    """Initial lambda: the weight of the memory in the hidden state."""
     offset_scale: float = 0.3
     """Metres of offset for a unit output."""
     appearance_scale: float = 0.1
@@ -154,36 +149,36 @@ class ScheduleConfig:
     """Wall-clock budget, counted from the end of the first update (which compiles kernels on a new machine):
     the schedule is compressed to fit when the machine is too slow for `steps`."""
     template_fraction: float = 0.12
-    """Share of the updates that fit the template alone, on near-rest frames."""
+    """Fraction of the updates that fit the template alone, on near-rest frames."""
     pretraining_fraction: float = 0.2
-    """Share of the updates that teach the network registered maps, without images; 0: no registration (the
-    paper's). Registration itself takes no updates, but its time is part of the budget."""
+    """Fraction of the updates that train the network on registered maps, without images; 0: no registration
+    (the paper's). Registration itself takes no updates, but its time is part of the budget."""
     pose_only_fraction: float = 0.0
-    """Share that trains the network without feedback and memory (the paper's stage 1)."""
+    """Fraction that trains the network without feedback and memory (the paper's stage 1)."""
     half_resolution_fraction: float = 0.85
-    """Share trained on images of half the size; the template is fitted to whole ones."""
+    """Fraction trained on images of half the size; the template is fitted to whole ones."""
     rollouts_per_worker: int = 64
-    """Rollouts that one worker advances together."""
+    """Rollouts that one worker steps together, its batch."""
     views: int = 1
     """Cameras rendered per rollout and rendered frame."""
     rendered_fraction: float = 0.5
-    """Share of the frames, drawn by chance, that are rendered and compared; the network sees all."""
+    """Fraction of the frames, drawn by chance, that are rendered and compared; the network sees all."""
     chunk_frames: int = 1
     """Frames K of truncated back-propagation through time (the paper gives none; its preset: 4). At equal
     time many rollouts of one frame teach more than few of several: the state carries on over whole clips."""
     mirrored_fraction: float = 0.5
-    """Share of the rollouts that see the mirrored motion (extension): the network learns from twice the
-    motions; body and cloth must be cut symmetrically, their looks need not be."""
+    """Fraction of the rollouts that see the mirrored motion (extension): the network learns from twice the
+    motions; body and cloth must be cut symmetrically, their appearance need not be symmetric."""
     max_rollout_frames: int = 0
     """Frames after which a rollout restarts when feedback begins; it doubles until clips are whole.
     0: whole clips from the start (a rollout that starts cold in mid-motion teaches the wrong thing)."""
     learning_rate: float = 2e-3
     """Peak rate of Adam for the network; cosine to 2 % of it."""
     muon_rate: float = 0.01
-    """Peak rate of Muon for the network's hidden convolutions, same cosine;
-    0: Adam trains them too (the paper's)."""
+    """Peak rate of Muon for the network's hidden convolutions, same cosine; 0: Adam trains them too (the
+    paper's)."""
     warmup: float = 0.03
-    """Share of the network's training in which its rates rise from zero."""
+    """Fraction of the network's training in which its rates rise from zero."""
     template_rate: float = 0.02
     """Factor on the template's rates once the network trains."""
     finetuning_factor: float = 0.75
@@ -220,8 +215,8 @@ class TrainConfig:
     def validate(self) -> None:
         """Raise ConfigError where settings contradict each other."""
         atlas, model, schedule = self.atlas, self.model, self.schedule
-        if self.preset not in PRESETS:
-            raise ConfigError(f"preset is {self.preset!r}; there are {', '.join(PRESETS)}")
+        if self.preset not in PRESET_NAMES:
+            raise ConfigError(f"preset is {self.preset!r}; there are {', '.join(PRESET_NAMES)}")
         if not model.channels:
             raise ConfigError("model.channels is empty; the encoder has at least one level")
         counts = {f"model.{name}": getattr(model, name) for name in ("upsample", "pixel_shuffle", "heads")}
@@ -268,123 +263,3 @@ class TrainConfig:
             raise ConfigError(
                 f"schedule.steps ({self.schedule.steps}) and workers ({self.workers}) start at 1"
             )
-
-
-PRESETS: dict[str, TrainConfig] = {
-    "demo": TrainConfig(),
-    "small": TrainConfig(
-        preset="small",
-        atlas=AtlasConfig(resolution=128, garment_rows=64),
-        model=ModelConfig(channels=(32, 64, 96), upsample=4),
-        schedule=ScheduleConfig(steps=20000, views=2),
-    ),
-    "paper": TrainConfig(
-        preset="paper",
-        atlas=AtlasConfig(resolution=512, garment="off", weight_smoothing=0.0),
-        model=ModelConfig(
-            wiring="shared",
-            axes="body",
-            window=10,
-            memory=10,
-            acceleration=False,
-            mean_time_constants=(),
-            channels=(64, 128, 256, 512),
-            heads=8,
-            upsample=1,
-            uv_feature_channels=0,
-            memory_weight=0.1,
-            appearance_scale=1.0,
-        ),
-        loss=LossConfig(
-            pyramid=1,
-            ssim=0.2,
-            lpips=0.5,
-            alpha=0.0,
-            spatial=0.0,
-            shape=0.0,
-            registered=0.0,
-            temporal_scale=1.0,
-            magnitude="frame",
-        ),
-        schedule=ScheduleConfig(
-            steps=300_000,
-            learning_rate=6e-4,
-            half_resolution_fraction=0.0,
-            rollouts_per_worker=1,
-            rendered_fraction=1.0,
-            chunk_frames=4,
-            pretraining_fraction=0.0,
-            pose_only_fraction=0.15,
-            mirrored_fraction=0.0,
-            max_rollout_frames=16,
-            muon_rate=0.0,
-        ),
-    ),
-}
-
-
-def config_to_json(config: TrainConfig) -> str:
-    """Return the settings as readable JSON."""
-    return json.dumps(dataclasses.asdict(config), indent=2) + "\n"
-
-
-def config_from_json(path: Path) -> TrainConfig:
-    """Read a config.json.
-
-    Raises:
-        ConfigError: it cannot be read, a setting is unknown, missing or of another kind, or settings
-            contradict each other.
-    """
-    values = read_json(path, ConfigError)
-    try:
-        config = _from_values(TrainConfig, values, "")
-        config.validate()
-    except ConfigError as error:
-        raise ConfigError(f"{path}: {error}; it was changed, or is of another version") from error
-    return config
-
-
-def _from_values(kind: type[T], values: Any, prefix: str) -> T:
-    """Return a dataclass of settings from JSON, in which each of them stands, and nothing else."""
-    if not isinstance(values, dict):
-        raise ConfigError(f"expected {prefix.rstrip('.') or 'the settings'} as an object, found {values!r}")
-    hints = get_type_hints(kind)
-    for what, names in (("unknown", values.keys() - hints), ("missing", hints.keys() - values)):
-        if names:
-            raise ConfigError(f"{what}: {', '.join(prefix + name for name in sorted(names))}")
-    return kind(**{name: _from_value(hint, values[name], prefix + name) for name, hint in hints.items()})
-
-
-def _from_value(hint: Any, value: Any, name: str) -> Any:
-    """Return a setting's value of the type that it has."""
-    if dataclasses.is_dataclass(hint):
-        return _from_values(cast(type, hint), value, f"{name}.")
-    parts = get_args(hint)
-    if get_origin(hint) is Literal:
-        fits = value in parts
-    elif get_origin(hint) is tuple:
-        fits = isinstance(value, list) and all(_is_of(each, parts[0]) for each in value)
-    else:
-        fits = any(_is_of(value, kind) for kind in parts or (hint,))
-    if not fits:
-        expected = " or ".join(map(repr, parts)) if get_origin(hint) is Literal else hint
-        raise ConfigError(f"{name} is {value!r}, expected {getattr(expected, '__name__', expected)}")
-    return tuple(value) if isinstance(value, list) else value
-
-
-def _is_of(value: Any, kind: type) -> bool:
-    """Return whether a JSON value is of a type; every integer is a number, too, and a truth value neither."""
-    if kind is float:
-        return isinstance(value, int | float) and not isinstance(value, bool)
-    return type(value) is kind
-
-
-def with_absolute_paths(config: TrainConfig) -> TrainConfig:
-    """Return settings that mean the same capture and body file in whatever folder they are read."""
-    body = None if config.body is None else str(Path(config.body).resolve())
-    return dataclasses.replace(config, capture=absolute_capture(config.capture), body=body)
-
-
-def absolute_capture(capture: str) -> str:
-    """Return the path of a capture as it is from any folder; `embedded` stays what it is."""
-    return capture if capture == EMBEDDED else str(Path(capture).resolve())

@@ -28,7 +28,7 @@ sys.exit(failed or LANES != {lanes})
 
 def test_fast_equals_slow_with_the_other_number_of_lanes(tmp_path):
     lanes = 24 - LANES
-    script = SCRIPT.format(wide=lanes == 16, lanes=lanes, tests=Path(__file__).with_name("test_raster.py"))
+    script = SCRIPT.format(wide=lanes == 16, lanes=lanes, tests=Path(__file__).with_name("test_agreement.py"))
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
     command = [sys.executable, "-c", script]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)

@@ -5,18 +5,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-
-from dsar.atomic_files import atomic_write
-from dsar.errors import ExportError, StorageError
+from dsar.errors import ExportError
 from dsar.types import Camera, Picture
 from dsar_exporters.checks import check_name
 from dsar_exporters.color import ColorTarget
 from dsar_exporters.exr.channels import color_channels, crop, data_channels
-from dsar_exporters.exr.completeness import is_complete
 from dsar_exporters.exr.cryptomatte import matte_metadata
 from dsar_exporters.exr.deep import deep_channels
-from dsar_exporters.exr.header import NO_COLOR, Window, make_header, openexr
+from dsar_exporters.exr.header import NO_COLOR, make_header
+from dsar_exporters.exr.openexr import require_openexr
+from dsar_exporters.exr.parts import holds_views, make_part, write_parts
+from dsar_exporters.exr.windows import check_size, data_window
 
 Compression = Literal["none", "rle", "zips", "zip", "piz", "pxr24", "b44", "b44a", "dwaa", "dwab"]
 Views = Literal["separate", "multipart"]
@@ -50,7 +49,7 @@ class ExrSequence:
     def __post_init__(self) -> None:
         """Check the name, and that there is a library to write with."""
         check_name("name", self.name)
-        openexr()
+        require_openexr()
 
     @property
     def key(self) -> str:
@@ -58,7 +57,7 @@ class ExrSequence:
         return repr((self.name, self.layers, self.target.key, self.compression, self.views, self.crop))
 
     @property
-    def together(self) -> bool:
+    def combines_cameras(self) -> bool:
         """Whether all cameras of a frame go into one file."""
         return self.views == "multipart"
 
@@ -71,44 +70,46 @@ class ExrSequence:
         for camera in cameras:
             check_name("camera name", camera.name)
         sizes = sorted({(camera.width, camera.height) for camera in cameras})
-        if self.together and len(sizes) > 1:
+        if self.combines_cameras and len(sizes) > 1:
             raise ExportError(
                 f"--exr-views multipart: expected cameras of one size, found {sizes}: give one with --res"
             )
 
-    def write(self, pictures: Sequence[Picture], jobs: Sequence[str]) -> list[Path]:
+    def write(self, pictures: Sequence[Picture], job_hashes: Sequence[str]) -> list[Path]:
         """Write a frame's pictures and return the files, which appear when they are complete.
 
         Args:
             pictures: One a camera.
-            jobs: For each the hash of all that its file depends on; see `complete`.
+            job_hashes: For each the hash of all that its file depends on; see `is_complete`.
         """
-        parts = [self.parts(picture, job) for picture, job in zip(pictures, jobs, strict=True)]
-        if self.together:
+        parts = [
+            self.parts(picture, job_hash) for picture, job_hash in zip(pictures, job_hashes, strict=True)
+        ]
+        if self.combines_cameras:
             path = self._path(pictures[0].frame, None)
-            write_parts(path, [part for each in parts for part in each])
+            write_parts(path, [part for picture_parts in parts for part in picture_parts])
             written = [path]
         else:
-            written = [self._path(each.frame, each.camera.name) for each in pictures]
-            for path, each in zip(written, parts, strict=True):
-                write_parts(path, each)
-        for picture, job in zip(pictures, jobs, strict=True):
+            written = [self._path(picture.frame, picture.camera.name) for picture in pictures]
+            for path, picture_parts in zip(written, parts, strict=True):
+                write_parts(path, picture_parts)
+        for picture, job_hash in zip(pictures, job_hashes, strict=True):
             if picture.deep is not None:
                 path = self._deep_path(picture.frame, picture.camera.name)
-                write_parts(path, [self._deep_part(picture, job)])
+                write_parts(path, [self._deep_part(picture, job_hash)])
                 written.append(path)
         return written
 
-    def complete(self, frame: int, cameras: Sequence[str], jobs: Sequence[str], deep: bool) -> bool:
+    def is_complete(self, frame: int, cameras: Sequence[str], job_hashes: Sequence[str], deep: bool) -> bool:
         """Return whether a frame's files are there, whole, and from these very jobs."""
-        views = list(zip(cameras, jobs, strict=True))
-        files = {self._path(frame, None): views} if self.together else {}
+        views = list(zip(cameras, job_hashes, strict=True))
+        files = {self._path(frame, None): views} if self.combines_cameras else {}
         for view in views:
-            if not self.together:
+            if not self.combines_cameras:
                 files[self._path(frame, view[0])] = [view]
             if deep:
                 files[self._deep_path(frame, view[0])] = [view]
-        return all(_holds(path, expected) for path, expected in files.items())
+        return all(holds_views(path, expected) for path, expected in files.items())
 
     def _path(self, frame: int, camera: str | None) -> Path:
         if camera is None:
@@ -118,106 +119,38 @@ class ExrSequence:
     def _deep_path(self, frame: int, camera: str) -> Path:
         return self.folder / camera / f"{self.name}_deep.{camera}.{frame:04d}.exr"
 
-    def parts(self, picture: Picture, job: str = "") -> list[Any]:
+    def parts(self, picture: Picture, job_hash: str = "") -> list[Any]:
         """Return the parts of a picture: one, or colour and data apart where colours lose by compression."""
-        _check_size(picture)
-        window, rows, columns = _window(picture, self.crop)
+        check_size(picture)
+        window, rows, columns = data_window(picture, self.crop)
         matte = matte_metadata(list(picture.aovs.coverage)) if "crypto" in self.layers else {}
         color = crop(color_channels(picture, self.layers, self.target), rows, columns)
         data = crop(data_channels(picture, self.layers), rows, columns)
         name = picture.camera.name
         # Parts of a file have to agree on it.
         interop_id = self.target.interop_id if "rgba" in self.layers else NO_COLOR
-        header = make_header(picture, interop_id, window, job)
+        header = make_header(picture, interop_id, window, job_hash)
         if self.compression in _LOSSY and color and data:
             # Lossless, whatever colours get: half a pixel of motion or of an id is no small error.
             return [
-                _part(header, color, f"rgba.{name}", self.compression),
-                _part(header | matte, data, f"data.{name}", "zips"),
+                make_part(header, color, f"rgba.{name}", self.compression),
+                make_part(header | matte, data, f"data.{name}", "zips"),
             ]
-        if not self.together:
+        if not self.combines_cameras:
             # A file of one view carries both, so that readers of either convention find it.
             header["multiView"] = [name]
         compression = "zips" if self.compression in _LOSSY and not color else self.compression
         # A file's only part goes without a name, which Blender would take for a layer's, and find no mattes.
-        return [_part(header | matte, color | data, name if self.together else "", compression)]
+        return [make_part(header | matte, color | data, name if self.combines_cameras else "", compression)]
 
-    def _deep_part(self, picture: Picture, job: str) -> Any:
+    def _deep_part(self, picture: Picture, job_hash: str) -> Any:
         assert picture.deep is not None
-        window, rows, columns = _window(picture, self.crop)
-        header = make_header(picture, self.target.interop_id, window, job)
+        window, rows, columns = data_window(picture, self.crop)
+        header = make_header(picture, self.target.interop_id, window, job_hash)
         color, alpha = picture.output.color.numpy(), picture.output.alpha.numpy()
         flat = self.target.premultiplied(color, alpha)
         channels = deep_channels(picture.deep, flat, self.target, rows, columns)
-        exr = openexr()
+        exr = require_openexr()
         header |= {"type": exr.deepscanline, "compression": exr.ZIPS_COMPRESSION}
         header["multiView"] = [picture.camera.name]
         return exr.Part(header, channels)
-
-
-def _part(header: dict[str, Any], channels: dict[str, Any], name: str, compression: str) -> Any:
-    exr = openexr()
-    kind = getattr(exr, "NO_COMPRESSION" if compression == "none" else f"{compression.upper()}_COMPRESSION")
-    return exr.Part(header | {"type": exr.scanlineimage, "compression": kind}, channels, name=name)
-
-
-def write_parts(path: Path, parts: Sequence[Any]) -> None:
-    """Write a file that appears when it is complete.
-
-    Raises:
-        StorageError: The disk does not take it.
-    """
-    with atomic_write(path) as draft:
-        openexr().File(list(parts)).write(str(draft))
-        if not is_complete(draft):
-            raise StorageError(f"{path}: the disk did not take its end: free some room, or write elsewhere")
-
-
-def _holds(path: Path, views: Sequence[tuple[str, str]]) -> bool:
-    """Return whether a file can be read to its end and says that it shows these cameras for these jobs."""
-    if not path.is_file():
-        return False
-    exr = openexr()
-    try:
-        with exr.File(str(path), header_only=True) as file:
-            # Copies: a file empties its headers when it is closed.
-            headers = [dict(part.header) for part in file.parts]
-        if {(each.get("view"), each.get("dsar/job")) for each in headers} != set(views):
-            return False
-        with exr.File(str(path)) as file:
-            # Parts that cannot be read to their end are left out.
-            return len(file.parts) == len(headers)
-    except (RuntimeError, ValueError, OSError):
-        return False
-
-
-def _check_size(picture: Picture) -> None:
-    height, width = picture.output.alpha.shape
-    camera, margin = picture.camera, 2 * picture.overscan
-    if (width, height) != (camera.width + margin, camera.height + margin):
-        raise ExportError(
-            f"frame {picture.frame}: expected an image of {camera.width + margin}x{camera.height + margin} "
-            f"from camera {camera.name}, found {width}x{height}: render with the camera that is passed"
-        )
-
-
-def _window(picture: Picture, cropped: bool) -> tuple[Window, slice, slice]:
-    """Return which pixels are written: in the display window's coordinates, and as rows and columns."""
-    height, width = picture.output.alpha.shape
-    top, bottom, left, right = 0, height, 0, width
-    if cropped:
-        hit = picture.output.alpha.numpy() > 0
-        if not hit.any():
-            # A file has to have a pixel.
-            top, bottom, left, right = 0, 1, 0, 1
-        else:
-            top, bottom = _extent(np.flatnonzero(hit.any(axis=1)))
-            left, right = _extent(np.flatnonzero(hit.any(axis=0)))
-    margin = picture.overscan
-    window = left - margin, top - margin, right - 1 - margin, bottom - 1 - margin
-    return window, slice(top, bottom), slice(left, right)
-
-
-def _extent(places: np.ndarray) -> tuple[int, int]:
-    """Return the first place, and the one after the last."""
-    return int(places[0]), int(places[-1]) + 1

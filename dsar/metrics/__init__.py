@@ -1,0 +1,1 @@
+"""Measures of images that training and evaluation share."""
