@@ -17,7 +17,7 @@ from torch import Tensor
 from dsar.avatar.avatar import Avatar
 from dsar.avatar.rollout import START_FRAME, roll_out
 from dsar.data.captures.multiview import MultiViewCapture
-from dsar.data.motions.mmd import motion_mmd
+from dsar.data.motions.mmd import PoseDistribution
 from dsar.evaluation.garment_metrics import garment_mask, measure_garment
 from dsar.evaluation.image_metrics import ImageMetric, correlation, load_perceptual
 from dsar.evaluation.profiling import read_clock, time_stages
@@ -231,13 +231,13 @@ def evaluate(
     heldout = {split: names for split, names in heldout.items() if names}
     videos, missing = evaluate_videos(avatar, capture, heldout, streams)
     skipped |= missing
+    training = PoseDistribution.from_motions(capture.motions[name] for name in capture.splits["train"])
     for split in ("train", "test", "nd", "fd"):
         names = [name for name in capture.splits.get(split, ()) if name in by_sequence]
         rows = summarize(by_sequence, names, len(capture.cameras)) if names else None
         if rows:
-            rows["mmd"] = (
-                motion_mmd(capture.motions, capture.splits["train"], names) if split != "train" else 0.0
-            )
+            motions = [capture.motions[name] for name in names]
+            rows["mmd"] = training.mmd(motions) if split != "train" else 0.0
         splits[split] = rows and rows | dict.fromkeys(VIDEO_METRICS) | videos.get(split, {})
     garments = {name: measure_garment(avatar, capture, name, 2 * stride) for name in capture.splits["test"]}
     if not all(garment_ground_truth(capture, name) for name in by_sequence):

@@ -8,9 +8,9 @@ import math
 import pytest
 import torch
 
-from dsar.avatar import rollout
 from dsar.avatar.avatar import Avatar
 from dsar.avatar.charts import Atlas, body_chart
+from dsar.avatar.player import Player
 from dsar.avatar.rollout import roll_out
 from dsar.body.files import load_body
 from dsar.body.skinning import forward_kinematics, skin_points
@@ -151,14 +151,13 @@ def test_any_frames_alone_are_those_of_the_whole(avatar, fps):
 )
 def test_the_network_goes_no_farther_than_the_last_frame_needs(avatar, monkeypatch, fps, frame, steps):
     made = []
-    outputs = rollout.network_outputs
+    forward_frame = Player.forward_frame
 
-    def counted(*arguments, **options):
-        for each in outputs(*arguments, **options):
-            made.append(each)
-            yield each
+    def counted(player):
+        made.append(player.next_frame)
+        return forward_frame(player)
 
-    monkeypatch.setattr(rollout, "network_outputs", counted)
+    monkeypatch.setattr(Player, "forward_frame", counted)
     motion = spin()
     assert len(list(roll_out(avatar, motion, delivered=resample(motion, fps), frames=[frame]))) == 1
     assert len(made) == steps

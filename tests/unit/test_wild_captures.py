@@ -151,7 +151,7 @@ def test_archives_may_have_a_folder_on_top_and_litter(folder, written):
         (("fps",), float("nan"), "expected 'fps' as a number above 0, found nan"),
         (("fps",), True, "expected 'fps' as int or float, found True"),
         (("betas",), [float("nan")], "expected 'betas' as a list of finite numbers"),
-        (("cameras", 0, "K", 0, 0), float("nan"), "K is not a 3x3 matrix of finite numbers"),
+        (("cameras", 0, "K", 0, 0), float("nan"), "expected K as a 3x3 list of finite numbers"),
         (("sequences", "sway", "frames"), float("inf"), "expected 'frames' as int, found inf"),
     ],
 )

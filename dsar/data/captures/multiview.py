@@ -12,10 +12,10 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from dsar.data.captures.frame_ranges import parse_frame_range
 from dsar.data.images.decoding import CACHE_BYTES
 from dsar.errors import CaptureError, ConfigError
 from dsar.geometry.cameras import farthest_cameras
+from dsar.geometry.frame_numbers import parse_frame_range
 from dsar.types import Body, Camera, Motion
 
 

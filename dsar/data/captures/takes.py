@@ -12,12 +12,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dsar.body.files import choose_body, load_body
-from dsar.data.captures.frame_ranges import parse_frame_range
 from dsar.data.captures.multiview import MultiViewCapture, Views
 from dsar.data.motions.files import rotate_motion
 from dsar.data.motions.mmd import label_sequences
 from dsar.data.motions.up_axis import rotation_to_y_up
 from dsar.errors import CaptureError
+from dsar.geometry.camera_checks import check_names_differ
+from dsar.geometry.frame_numbers import parse_frame_range
 from dsar.geometry.rotations import matrix_from_axis_angle
 from dsar.types import Body, Camera, Motion
 
@@ -91,12 +92,7 @@ def make_capture(
         CaptureError: nothing is left to train with, or images are missing altogether.
         BodyError: the body file is not usable.
     """
-    names = [camera.name for camera in cameras]
-    if len(set(names)) != len(names):
-        raise CaptureError(
-            f"capture {root}: expected cameras whose names differ in letters and digits, found "
-            f"{', '.join(names)}"
-        )
+    check_names_differ(f"capture {root}", [camera.name for camera in cameras], CaptureError)
     body, path = fitted_body(str(root), options.body, betas, gender)
     turn = apply_orientation(str(root), [take.motion for take in takes])
     cameras = [rotate_camera_world(camera, turn) for camera in cameras]
