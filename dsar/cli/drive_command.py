@@ -4,7 +4,7 @@ import hashlib
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -39,6 +39,11 @@ class DrivenAvatar:
     def cameras(self) -> tuple[Camera, ...]:
         """Those of the capture; a DsarError where there is neither it nor what a run keeps of it."""
         return self.scene().cameras
+
+    @cached_property
+    def whole(self) -> GaussianSequence:
+        """The Gaussians of all frames that are delivered."""
+        return self.roll_out()
 
     def roll_out(self, frames: Sequence[int] | None = None) -> GaussianSequence:
         """Return the Gaussians of some frames, all by default."""
