@@ -107,9 +107,7 @@ def test_mistakes_in_matrices_made_by_hand_are_named(scalar, oblong):
         "centimetres": matrix(K, np.hstack([T[:, :3], T[:, 3:] * [[100], [100], [100], [1]]])),
     }
     assert find_fault(oblong, observations, matrix_projection(matrix(K, T))) is None
-    found = {
-        name: find_fault(oblong, observations, matrix_projection(each)) for name, each in wrong.items()
-    }
+    found = {name: find_fault(oblong, observations, matrix_projection(each)) for name, each in wrong.items()}
     assert found == {name: name for name in wrong}
 
 
