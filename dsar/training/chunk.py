@@ -226,5 +226,6 @@ class ChunkTrainer:
         return UpdateMetrics(float(loss.detach()), float(mse) / count if mse is not None else None)
 
     def _first_not_finite(self) -> str:
-        named = [*self.avatar.named_parameters(), *self.state.state_dict().items()]
+        state = {f"state.{name}": value for name, value in self.state.rollout_tensors().items()}
+        named = [*self.avatar.named_parameters(), *state.items()]
         return next((name for name, value in named if not value.isfinite().all()), "the rendered image")
