@@ -26,13 +26,13 @@ BOXES = {
     "maps": (5.0, 4.6, 2.0, INPUT, "Input maps", "equations 4, 6", "avatar/input_maps.py"),
     "encoder": (7.6, 4.6, 2.0, NETWORK, "Encoder", "equation 5", "network/encoder.py"),
     "aggregation": (10.1, 4.6, 2.4, NETWORK, "Aggregation", "equations 7-11, 15", "network/temporal.py"),
-    "bank": (13.0, 4.6, 2.0, NETWORK, "Memory bank", "equations 12-14", "network/temporal.py"),
+    "bank": (13.0, 4.6, 2.0, NETWORK, "Memory bank", "equations 12-14", "network/memory.py"),
     "decoder": (15.5, 4.6, 2.0, NETWORK, "Decoder", "equation 16", "network/decoder.py"),
     "template": (15.5, 2.5, 2.0, GEOMETRY, "Template, residuals", "equation 2", "avatar/template.py"),
     "posing": (13.0, 2.5, 2.0, GEOMETRY, "Posing", "equations 1, 3", "avatar/posing.py"),
     "gaussians": (10.1, 2.5, 2.4, GEOMETRY, "Posed Gaussians", "", "types.py"),
     "raster": (7.6, 2.5, 2.0, TRAINING, "Rasteriser", "", "raster/"),
-    "losses": (5.0, 2.5, 2.0, TRAINING, "Losses", "equations 17-23", "training/losses.py"),
+    "losses": (5.0, 2.5, 2.0, TRAINING, "Losses", "equations 17-23", "training/chunk.py"),
     "capture": (2.5, 2.5, 2.0, INPUT, "Images and masks", "", "data/captures"),
     "sequence": (10.1, 0.5, 2.4, DELIVERY, "Sequence of frames", "", "avatar/rollout.py"),
     "usd": (13.0, 0.5, 2.0, DELIVERY, "USD, PLY, SPZ, GLB", "", "dsar_exporters"),
@@ -71,7 +71,8 @@ def loop(
 
 def draw(path: Path) -> None:
     """Write the drawing, as SVG or PNG."""
-    plt.rcParams["svg.hashsalt"] = "dsar"
+    # Text stays text, so that tests can read it.
+    plt.rcParams |= {"svg.hashsalt": "dsar", "svg.fonttype": "none"}
     figure, axes = plt.subplots(figsize=(17.7, 7.6))
     for x, y, width, color, title, equations, where in BOXES.values():
         axes.add_patch(FancyBboxPatch((x, y), width, HEIGHT, boxstyle="round,pad=0,rounding_size=0.1",
@@ -90,7 +91,7 @@ def draw(path: Path) -> None:
          "state stream: hidden states (14)", (13.6, 6.35))  # fmt: skip
     axes.plot([6.0, 6.0, 8.6], [2.5 + HEIGHT, 4.05, 4.05], color="#ca6f1e", linewidth=1.6, linestyle="--")
     arrow(axes, (8.6, 4.05), (8.6, 4.6), color="#ca6f1e", linestyle="--", linewidth=1.6)
-    text = "gradients, through a chunk of frames (training/chunk.py)"
+    text = "gradients, through a chunk of frames"
     axes.text(8.75, 4.05, text, color="#ca6f1e", fontsize=10.5, va="center")
     for row, (color, text) in enumerate(LEGEND.items()):
         y = 1.25 - 0.3 * row

@@ -66,7 +66,7 @@ class Check(Common):
             sys.stdout.write(
                 f"{camera.name:16s} {camera.images} images, {camera.missing} missing, {shares}\n"
             )
-        for key, value in verdict.figures.items():
+        for key, value in verdict.to_json()["figures"].items():
             sys.stdout.write(f"{key}: {value}\n")
         sys.stdout.write(
             f"training with the demo's preset: {needs['worker_bytes'] / 2**30:.1f} GiB a worker, and "

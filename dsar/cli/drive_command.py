@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 from dsar.cli.command import RunCommand, resolve_sequence
 from dsar.errors import ConfigError, DsarError
+from dsar.geometry.frame_numbers import parse_frames
 from dsar.geometry.frame_rates import exact_rate, parse_rate, same_rate
 from dsar.types import Body, Camera, GaussianSequence, Motion
 
@@ -64,8 +65,6 @@ class DriveCommand(RunCommand):
 
     def requested_frames(self) -> list[int] | None:
         """Return the frames that are asked for, None for all."""
-        from dsar_exporters import parse_frames
-
         return None if self.frames is None else parse_frames(self.frames)
 
     def check_name(self, name: str) -> None:
@@ -83,6 +82,7 @@ class DriveCommand(RunCommand):
     def open(self) -> DrivenAvatar:
         """Return the avatar and its motion."""
         from dsar.data.motions.files import read_motion, resample
+        from dsar.data.motions.kinematics import trace_joints
         from dsar.data.motions.plausibility import check_plausibility
         from dsar.training.checkpoint import Run, load_checkpoint
         from dsar.training.scene import open_scene
@@ -99,7 +99,7 @@ class DriveCommand(RunCommand):
         else:
             rate = None if self.motion_fps is None else parse_rate(self.motion_fps, "--motion-fps")
             motion = read_motion(file, avatar.body, up=self.up, fps=rate)
-            check_plausibility(avatar.body, motion)
+            check_plausibility(trace_joints(avatar.body, motion))
             read = _digest(file.read_bytes())
         provenance["motion_hash"] = _hash(motion)
         driven = delivered = resample(motion, avatar.fps)

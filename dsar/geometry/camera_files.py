@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from dsar.atomic_files import atomic_write
 from dsar.errors import ConfigError
+from dsar.geometry.camera_checks import check_name, check_names_differ, make_camera, quote_value
 from dsar.geometry.camera_paths import START_FRAME, CameraPath
 from dsar.geometry.frame_rates import exact_rate, same_rate
 from dsar.text import read_json
@@ -21,9 +20,7 @@ from dsar.types import Camera
 
 _logger = logging.getLogger(__name__)
 
-_IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _FRAME = re.compile(r"-?\d+(\.\d+)?", re.ASCII)
-_RIGID_TOLERANCE = 1e-4
 
 
 def list_cameras_json(path: Path) -> list[str]:
@@ -73,8 +70,8 @@ def _load(path: Path) -> Mapping[str, Any]:
     entries = record.get("cameras") if isinstance(record, dict) else None
     if not isinstance(entries, list) or not entries:
         raise ConfigError(
-            f'{path}: expected {{"cameras": [...]}} with at least one camera, found {_shown(record)}: write '
-            "it as in docs/capture-format.md"
+            f'{path}: expected {{"cameras": [...]}} with at least one camera, found '
+            f"{quote_value(record)}: write it as in docs/capture-format.md"
         )
     return record
 
@@ -86,12 +83,12 @@ def _by_name(record: Mapping[str, Any], path: Path) -> dict[str, tuple[str, Mapp
         where = f"{path}, camera {index}"
         if not isinstance(entry, dict):
             raise ConfigError(
-                f"{where}: expected name, K, T_camera_world, width and height, found {_shown(entry)}: "
+                f"{where}: expected name, K, T_camera_world, width and height, found {quote_value(entry)}: "
                 "correct it"
             )
-        names.append(_checked_name(entry.get("name"), where))
+        names.append(check_name(where, entry.get("name"), ConfigError))
         found.append((f"{where} {names[-1]}", entry))
-    _refuse_doubled(names, str(path))
+    check_names_differ(str(path), names, ConfigError)
     return dict(zip(names, found, strict=True))
 
 
@@ -105,8 +102,8 @@ def write_cameras_json(paths: Sequence[CameraPath], path: Path) -> Path:
     if not names:
         raise ConfigError(f"{path}: expected cameras to write, found none: give at least one")
     for name in names:
-        _checked_name(name, str(path))
-    _refuse_doubled(names, str(path))
+        check_name(str(path), name, ConfigError)
+    check_names_differ(str(path), names, ConfigError)
     with atomic_write(path) as draft:
         draft.write_text(cameras_to_json(paths))
     return path
@@ -134,15 +131,13 @@ def _written(path: CameraPath) -> str:
 
 
 def _read_path(entry: Mapping[str, Any], where: str) -> CameraPath:
-    name = entry["name"]
-    size = _size(entry, "width", where), _size(entry, "height", where)
     frames = entry.get("frames")
     if frames is None:
-        return CameraPath((_read_camera(entry, name, size, where),))
+        return CameraPath((_read_camera(where, entry, entry),))
     keyed = _keyed(frames, where)
     cameras = [
-        _read_camera({**entry, **values}, name, size, f"{where}, frame {frame:.12g}")
-        for frame, values in keyed.items()
+        _read_camera(f"{where}, frame {frame:.12g}", entry, {**entry, **keys})
+        for frame, keys in keyed.items()
     ]
     return CameraPath(tuple(cameras), tuple(keyed))
 
@@ -151,7 +146,7 @@ def _rate(record: Mapping[str, Any], where: str) -> float | None:
     """Return the frames per second of a file's frame numbers, if it says so."""
     rate = record.get("fps")
     if rate is not None and (type(rate) not in (int, float) or not 0 < rate < math.inf):
-        raise ConfigError(f"{where}: expected fps as a number > 0, found {_shown(rate)}: correct it")
+        raise ConfigError(f"{where}: expected fps as a number > 0, found {quote_value(rate)}: correct it")
     return None if rate is None else float(rate)
 
 
@@ -168,74 +163,19 @@ def _keyed(frames: object, where: str) -> dict[float, Mapping[str, Any]]:
         if not _FRAME.fullmatch(key) or float(key) in keyed or not isinstance(values, dict):
             raise ConfigError(
                 f'{where}: expected frames as {{"1001": {{"T_camera_world": ...}}}}, each number once, found '
-                f"{key!r}: {_shown(values)}: correct it"
+                f"{key!r}: {quote_value(values)}: correct it"
             )
         keyed[float(key)] = values
     if not keyed:
         raise ConfigError(
-            f"{where}: expected frames by number, at least one, found {_shown(frames)}: leave out `frames` "
-            "for a camera at rest"
+            f"{where}: expected frames by number, at least one, found {quote_value(frames)}: leave out "
+            "`frames` for a camera at rest"
         )
     return dict(sorted(keyed.items()))
 
 
-def _read_camera(entry: Mapping[str, Any], name: str, size: tuple[int, int], where: str) -> Camera:
-    K, transform = _matrix(entry, "K", 3, where), _matrix(entry, "T_camera_world", 4, where)
-    if not (K[0, 0] > 0 and K[1, 1] > 0 and K[1, 0] == 0 and K[2].tolist() == [0.0, 0.0, 1.0]):
-        raise ConfigError(
-            f"{where}: expected K as [[fx, s, cx], [0, fy, cy], [0, 0, 1]] in pixels, fx and fy > 0, found "
-            f"{K.tolist()}: correct it"
-        )
-    rotation = transform[:3, :3].double()
-    error = float((rotation @ rotation.T - torch.eye(3).double()).abs().max())
-    turn = float(torch.linalg.det(rotation))
-    if error > _RIGID_TOLERANCE or turn < 0 or transform[3].tolist() != [0.0, 0.0, 0.0, 1.0]:
-        raise ConfigError(
-            f"{where}: expected T_camera_world as a rotation, a translation and a last row 0 0 0 1, "
-            f"found rows off orthonormal by {error:.1e}, determinant {turn:.3f} and last row "
-            f"{transform[3].tolist()}: take scale and mirroring out"
-        )
-    return Camera(K, transform, *size, name)
-
-
-def _matrix(entry: Mapping[str, Any], key: str, size: int, where: str) -> Float[Tensor, "n n"]:
-    value = entry.get(key)
-    try:
-        matrix = torch.tensor(value, dtype=torch.float32)
-    except (TypeError, ValueError, RuntimeError, OverflowError):
-        matrix = torch.empty(0)
-    if matrix.shape != (size, size) or not bool(matrix.isfinite().all()):
-        raise ConfigError(
-            f"{where}: expected {key} as a {size}x{size} list of finite numbers, found {_shown(value)}: "
-            "write it as in docs/capture-format.md"
-        )
-    return matrix
-
-
-def _size(entry: Mapping[str, Any], key: str, where: str) -> int:
-    value = entry.get(key)
-    if type(value) is not int or value < 1:
-        raise ConfigError(f"{where}: expected {key} in pixels, a whole number > 0, found {_shown(value)}")
-    return value
-
-
-def _checked_name(name: object, where: str) -> str:
-    if not isinstance(name, str) or not _IDENTIFIER.fullmatch(name):
-        raise ConfigError(
-            f"{where}: expected a name of letters, digits and _ (no leading digit), found {_shown(name)}: "
-            "rename the camera"
-        )
-    return name
-
-
-def _refuse_doubled(names: Sequence[str], where: str) -> None:
-    if doubled := sorted({name for name in names if names.count(name) > 1}):
-        raise ConfigError(
-            f"{where}: expected names that differ, found {', '.join(doubled)} twice: rename one"
-        )
-
-
-def _shown(value: object) -> str:
-    """Return what was found, short enough for a message."""
-    text = repr(value)
-    return text if len(text) <= 100 else f"{text[:97]}..."
+def _read_camera(where: str, entry: Mapping[str, Any], keys: Mapping[str, Any]) -> Camera:
+    """Return a camera whose matrices are those of a key, name and size those of the entry."""
+    K, T_camera_world = keys.get("K"), keys.get("T_camera_world")
+    size = entry.get("width"), entry.get("height")
+    return make_camera(where, entry["name"], K, T_camera_world, size, ConfigError)

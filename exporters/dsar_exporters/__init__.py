@@ -7,7 +7,6 @@ mix of formats from one rollout.
 
 from dsar_exporters.delivery import Delivery, Output, export
 from dsar_exporters.exr import ColorTarget, ExrSequence, exr_path, ocio_config, write_exr
-from dsar_exporters.frames import parse_frames
 from dsar_exporters.inspection import find_faults
 from dsar_exporters.projections import read_back_projections
 from dsar_exporters.splats import (
@@ -36,7 +35,6 @@ __all__ = [
     "find_faults",
     "list_usd_cameras",
     "ocio_config",
-    "parse_frames",
     "read_back_projections",
     "read_ply",
     "read_splats",

@@ -9,8 +9,8 @@ import pytest
 import dsar_exporters
 from dsar.cli import main
 from dsar.errors import DsarError
+from dsar.geometry.camera_faults import PROJECTION_FAULTS
 from dsar_render.crosscheck.backend import LLVM, find_llvm
-from dsar_render.crosscheck.mistakes import MISTAKES
 
 pytest.importorskip("mitsuba")
 
@@ -29,7 +29,7 @@ def test_a_run_agrees_with_mitsuba(trained, tmp_path, capsys):
     assert found["camera_px_max"] < 0.1
     assert found["silhouette_iou"] >= 0.99
     assert found["depth_mae_m"] < 1e-3
-    assert found["seeded_wrong_cameras_caught"] == [mistake.name for mistake in MISTAKES]
+    assert found["seeded_wrong_cameras_caught"] == [mistake.name for mistake in PROJECTION_FAULTS]
     assert set(found["cameras"]) == {"cam0", "cam1", "cam2", "cam3"}
     assert all(
         set(each["residuals"]) == {"ours", "usd", "exr", "exr_lens"} for each in found["cameras"].values()

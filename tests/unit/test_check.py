@@ -241,11 +241,9 @@ def test_a_clean_capture_passes(clean):
         assert camera.inside > 0.995
         assert 0.5 < camera.iou < 0.95, "a skirt hides what no body fills"
     figures = verdict.figures
-    assert figures["divergence"]["turn"]["mmd_squared"] == pytest.approx(
-        figures["divergence"]["turn"]["mmd"] ** 2
-    )
-    assert sum(figures["fastest_joint_histogram"].values()) == 2 * (FRAMES - 1)
-    assert figures["disk_bytes"] == sum(path.stat().st_size for path in clean.rglob("*") if path.is_file())
+    assert figures.divergence["turn"].mmd_squared == pytest.approx(figures.divergence["turn"].mmd ** 2)
+    assert sum(figures.fastest_joint_histogram.values()) == 2 * (FRAMES - 1)
+    assert figures.disk_bytes == sum(path.stat().st_size for path in clean.rglob("*") if path.is_file())
     json.dumps(verdict.to_json())
 
 

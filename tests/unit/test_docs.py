@@ -19,25 +19,12 @@ PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("benc
 LIVING = [page for page in PAGES if page.parent != LOG and page.name != "CHANGELOG.md"]
 """Pages that speak of the code as it is; log and changelog keep the names of their day."""
 PACKAGES = {"dsar": ROOT, "dsar_exporters": ROOT / "exporters", "dsar_render": ROOT / "render"}
-ROOMS = [ROOT, ROOT / "dsar", *PACKAGES.values()]
+ROOMS = [ROOT, ROOT / "dsar", ROOT / "exporters", ROOT / "render", ROOT / "exporters" / "dsar_exporters"]
 """Folders from which a path in a document is meant."""
 FENCE = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
 CODE = re.compile(r"`([^`\n]+)`")
 SOURCE = re.compile(r"(?:[\w.-]+/)+[\w.-]+\.(?:py|mjs|md|json|svg|png|jpg|sh)|(?:[a-z_]+/)+|[a-z_]+\.py")
-USERS = {
-    "4x",
-    "Capture",
-    "SERIAL",
-    "checkpoint",
-    "exr",
-    "garment",
-    "images",
-    "masks",
-    "motion",
-    "name",
-    "ply",
-}
-USERS |= {"previews", "runs"}
+USERS = set("4x Capture SERIAL checkpoint exr garment images masks motion name ply previews runs".split())
 """First folders of paths in runs and captures, which are the user's."""
 COMMANDS = ("check", "train", "export", "render", "eval", "stress", "crosscheck")
 
@@ -87,6 +74,13 @@ def test_every_file_that_is_named_exists(page):
         if not any((room / path).exists() for room in ROOMS) and not list(ROOT.glob(f"dsar/**/{path}"))
     ]
     assert missing == []
+
+
+def test_the_drawing_of_the_architecture_names_files_that_exist():
+    text = " ".join(re.findall(r">([^<>]+)</text>", (ROOT / "docs" / "img" / "architecture.svg").read_text()))
+    named = re.findall(r"[a-z_]+/[a-z_]+\.py|data/[a-z]+|dsar_[a-z]+", text)
+    assert len(named) > 10
+    assert [path for path in named if not any((room / path).exists() for room in ROOMS)] == []
 
 
 @cache
@@ -222,3 +216,33 @@ def test_every_equation_of_the_paper_is_in_the_table():
 @pytest.mark.parametrize(("numbers", "row"), equation_rows(), ids=lambda value: str(value)[:20])
 def test_every_row_of_equations_names_a_function_in_a_file(numbers, row):
     assert any(name in definitions(file) for file, name in words(row[1])), row
+
+
+@cache
+def cited_equations():
+    """Return, by equation, the public functions and classes whose docstrings cite it (see test_equations)."""
+    found = {}
+
+    def visit(file, body, prefix):
+        for node in body:
+            if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
+                text = " ".join((ast.get_docstring(node) or "").split())
+                for numbers in re.findall(r"[Ee]quations? (\d+(?:(?:, | and )\d+)*)", text):
+                    for number in equations(numbers):
+                        found.setdefault(number, []).append((file, prefix + node.name))
+                visit(file, node.body, f"{prefix}{node.name}.")
+
+    for file in sorted((ROOT / "dsar").rglob("*.py")):
+        if file != ROOT / "dsar" / "network" / "reference.py":
+            visit(file, ast.parse(file.read_text()).body, "")
+    return found
+
+
+@pytest.mark.parametrize("number", range(1, 25))
+def test_the_table_names_the_function_that_implements_an_equation(number):
+    named = {
+        reference for numbers, row in equation_rows() if number in numbers for reference in words(row[1])
+    }
+    implementing = cited_equations().get(number, [])
+    assert implementing, f"no public function or class cites equation {number}"
+    assert set(implementing) <= named

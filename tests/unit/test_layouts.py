@@ -150,7 +150,7 @@ def test_captures_are_opened_anew_in_other_processes(written, name):
 
 
 def test_without_ranges_two_thirds_train_and_a_gap_is_left(written, original, tmp_path):
-    from dsar.data.captures.takes import GAP, split_take
+    from dsar.data.captures.splits import GAP, split_take
 
     assert split_take(300, None, None) == (range(200), range(200 + GAP, 300))
     assert split_take(300, "0-99", None) == (range(100), range(200 + GAP, 300))
@@ -251,7 +251,7 @@ def test_a_broken_file_is_refused_with_its_name_and_fault(folder, written, name,
         ({"R": None}, "camera cam01.*found no R"),
         ({"T": [0.0]}, "expected T of 3 numbers"),
         ({"K": ["a"] * 9}, "K is not made of numbers"),
-        ({"R": [2.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]}, "T_camera_world is not rigid"),
+        ({"R": [2.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]}, "expected T_camera_world as a rotation"),
         ({"imgSize": [48]}, "expected imgSize"),
         ({"distCoeff": [0.1] * 8}, "expected distCoeff as k1, k2, p1, p2, k3"),
         ({"distCoeff": [float("nan")]}, "expected distCoeff"),

@@ -125,8 +125,8 @@ def test_pickling_sends_a_path_and_no_images(folder):
         (("cameras", 0, "name"), "cam1", "names that differ"),
         (("cameras", 0, "name"), "front left", "letters, digits"),
         (("cameras", 0, "K", 0, 0), -1.0, "expected K as"),
-        (("cameras", 1, "T_camera_world", 0, 0), 2.0, "cam1: T_camera_world is not rigid"),
-        (("cameras", 1, "T_camera_world"), [[1, 0], [0, 1]], "not a 4x4 matrix"),
+        (("cameras", 1, "T_camera_world", 0, 0), 2.0, "cam1: expected T_camera_world as a rotation"),
+        (("cameras", 1, "T_camera_world"), [[1, 0], [0, 1]], "expected T_camera_world as a 4x4 list"),
         (
             ("cameras", 0, "width"),
             13,

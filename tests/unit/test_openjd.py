@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from dsar.errors import ConfigError
-from dsar_exporters import parse_frames
+from dsar.geometry.frame_numbers import parse_frames
 from dsar_render.openjd import openjd_template
 
 OPENJD = Path(sys.executable).parent / "openjd"

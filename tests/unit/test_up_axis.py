@@ -12,9 +12,10 @@ import torch
 import dsar.data.motions.files as motion_files
 from dsar.body.files import load_body
 from dsar.data.motions.files import EMBEDDED_MOTIONS, read_motion, rotate_motion, write_motion
+from dsar.data.motions.kinematics import trace_joints
 from dsar.data.motions.plausibility import check_plausibility
 from dsar.data.motions.smplx_npz import read_arrays, read_poses, read_rate
-from dsar.data.motions.up_axis import detect_up_axis, joint_positions, rotation_to_y_up
+from dsar.data.motions.up_axis import detect_up_axis, rotation_to_y_up
 from dsar.errors import MotionError
 from dsar.types import Body, Motion
 
@@ -39,7 +40,7 @@ def walk(body: Body) -> Motion:
 def lying(body: Body, walk: Motion) -> Motion:
     """The walker on the floor, away from the origin."""
     motion = rotate_motion(walk, body, ON_THE_BACK)
-    low = joint_positions(body, motion)[..., 1].min()
+    low = trace_joints(body, motion).positions[..., 1].min()
     shift = torch.tensor([1.5, 0.05 - float(low), 1.0])
     return dataclasses.replace(motion, translations=motion.translations + shift)
 
@@ -71,7 +72,7 @@ def test_embedded_clips_are_read_as_z_up_bit_for_bit_and_nothing_is_wrong_with_t
     expected = rotate_motion(z_up, body, turn)
     assert torch.equal(motion.rotations, expected.rotations)
     assert torch.equal(motion.translations, expected.translations)
-    assert check_plausibility(body, motion) == []
+    assert check_plausibility(trace_joints(body, motion)) == []
 
 
 def test_the_same_motion_with_y_or_z_up_moves_every_vertex_alike(
@@ -82,7 +83,7 @@ def test_the_same_motion_with_y_or_z_up_moves_every_vertex_alike(
     y_up, z_up = (read_motion(tmp_path / f"{name}.npz", body) for name in "yz")
     assert torch.equal(y_up.rotations, walk.rotations)
     assert torch.equal(y_up.translations, walk.translations)
-    assert torch.allclose(joint_positions(body, y_up), joint_positions(body, z_up), atol=1e-5)
+    assert torch.allclose(trace_joints(body, y_up).positions, trace_joints(body, z_up).positions, atol=1e-5)
 
 
 @pytest.mark.parametrize("axis", ["y", "-y", "z", "-z", "x", "-x"])
@@ -90,9 +91,9 @@ def test_any_axis_may_be_up(tmp_path: Path, body: Body, walk: Motion, axis: str)
     turned = rotate_motion(walk, body, rotation_to_y_up(axis).T)
     # As in the frame of a camera four metres away, with the feet on no floor.
     turned = dataclasses.replace(turned, translations=turned.translations + torch.tensor([0.3, 0.5, 4.0]))
-    found = joint_positions(body, read_motion(written(tmp_path / "m.npz", turned), body))
+    found = trace_joints(body, read_motion(written(tmp_path / "m.npz", turned), body)).positions
     shift = rotation_to_y_up(axis) @ torch.tensor([0.3, 0.5, 4.0])
-    assert torch.allclose(found, joint_positions(body, walk) + shift, atol=1e-5)
+    assert torch.allclose(found, trace_joints(body, walk).positions + shift, atol=1e-5)
 
 
 def test_quarter_turns_are_rotations_that_bring_their_axis_up() -> None:
@@ -111,7 +112,7 @@ def test_who_lies_most_of_the_time_is_not_stood_up(
     motion = chained(lying, lying, walk)
     path = written(tmp_path / "m.npz", rotate_motion(motion, body, rotation_to_y_up(up).T))
     assert torch.allclose(
-        joint_positions(body, read_motion(path, body)), joint_positions(body, motion), atol=1e-5
+        trace_joints(body, read_motion(path, body)).positions, trace_joints(body, motion).positions, atol=1e-5
     )
 
 
@@ -120,7 +121,9 @@ def test_who_lies_all_the_time_is_as_the_format_has_it_with_a_warning(
 ) -> None:
     write_motion(tmp_path / "swim.npz", lying, body)
     motion = read_motion(tmp_path / "swim.npz", body)
-    assert torch.allclose(joint_positions(body, motion), joint_positions(body, lying), atol=1e-5)
+    assert torch.allclose(
+        trace_joints(body, motion).positions, trace_joints(body, lying).positions, atol=1e-5
+    )
     assert "say --up y" in caplog.messages[0]
     assert [record.levelno for record in caplog.records] == [logging.WARNING]
 
@@ -136,15 +139,15 @@ def test_who_stands_about_the_origin_without_a_floor_is_not_taken_for_lying(
 
 def test_the_told_axis_is_taken_over_what_the_motion_shows(tmp_path: Path, body: Body, walk: Motion) -> None:
     path = written(tmp_path / "m.npz", walk)
-    expected = joint_positions(body, walk) @ rotation_to_y_up("z").T
-    assert torch.allclose(joint_positions(body, read_motion(path, body, up="z")), expected, atol=1e-5)
+    expected = trace_joints(body, walk).positions @ rotation_to_y_up("z").T
+    assert torch.allclose(trace_joints(body, read_motion(path, body, up="z")).positions, expected, atol=1e-5)
     assert torch.equal(read_motion(path, body, up="y").rotations, walk.rotations)
 
 
 def test_who_sits_on_a_floor_is_upright(body: Body, walk: Motion) -> None:
     seated = dataclasses.replace(walk, rotations=walk.rotations.clone())
     seated.rotations[:, 1:3] = torch.tensor([-1.5, 0.0, 0.0])
-    assert detect_up_axis(joint_positions(body, seated), "z").axis == "y"
+    assert detect_up_axis(trace_joints(body, seated).positions, "z").axis == "y"
 
 
 def lifted(motion: Motion, *shift: float) -> Motion:
@@ -175,7 +178,7 @@ def jumping(motion: Motion) -> Motion:
 def test_what_is_wrong_with_a_motion_is_named_with_its_remedy(
     body: Body, walk: Motion, make, message: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    faults = check_plausibility(body, make(body, walk))
+    faults = check_plausibility(trace_joints(body, make(body, walk)))
     assert faults
     assert caplog.messages == [f"Motion {walk.name}: {fault}" for fault in faults]
     assert re.search(message, "; ".join(faults)), faults
@@ -185,6 +188,8 @@ def test_who_cannot_be_is_refused(body: Body, walk: Motion) -> None:
     folded = walk.rotations.clone()
     folded[:, 1:3] = torch.tensor([-2.9, 0.0, 0.0])
     with pytest.raises(MotionError, match=r"folded onto its legs in 100% of the frames"):
-        check_plausibility(body, dataclasses.replace(walk, rotations=folded))
+        check_plausibility(trace_joints(body, dataclasses.replace(walk, rotations=folded)))
     with pytest.raises(MotionError, match="not finite"):
-        check_plausibility(body, dataclasses.replace(walk, translations=walk.translations * float("nan")))
+        check_plausibility(
+            trace_joints(body, dataclasses.replace(walk, translations=walk.translations * float("nan")))
+        )

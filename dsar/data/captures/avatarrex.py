@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from dsar.data.captures.calibration import camera_name, make_camera, opencv_camera
+from dsar.data.captures.calibration import camera_name, opencv_camera
 from dsar.data.captures.multiview import MultiViewCapture
 from dsar.data.captures.takes import OpenOptions, Take, make_capture
 from dsar.data.folders import check_name, find_file, list_folder, list_images
@@ -23,6 +23,7 @@ from dsar.data.images.distortion import parse_distortion
 from dsar.data.images.photos import Photos, read_missing_list
 from dsar.data.motions.smplx_npz import read_arrays, read_poses
 from dsar.errors import CaptureError
+from dsar.geometry.camera_checks import make_camera
 from dsar.geometry.rotations import matrix_from_axis_angle
 from dsar.text import read_json, read_text
 from dsar.types import Camera, Motion
@@ -95,7 +96,7 @@ def _read_row(where: str, row: Mapping[str, str]) -> Camera:
     transform = torch.eye(4, dtype=torch.float64)
     transform[:3, :3] = matrix_from_axis_angle(turn).T
     transform[:3, 3] = -transform[:3, :3] @ place
-    return make_camera(where, camera_name(row["name"]), K, transform.tolist(), (width, height))
+    return make_camera(where, camera_name(row["name"]), K, transform.tolist(), (width, height), CaptureError)
 
 
 def _read_calibration(where: Path, root: Path, views: Mapping[str, str]) -> tuple[list[Camera], Photos]:

@@ -12,13 +12,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dsar.body.files import choose_body, load_body
-from dsar.data.captures.calibration import make_camera
 from dsar.data.captures.multiview import MultiViewCapture, OneToMany
 from dsar.data.folders import check_name, find_file, inside
 from dsar.data.images.conversions import ConversionLog
 from dsar.data.images.cutouts import Cutouts
 from dsar.data.motions.files import read_motion
 from dsar.errors import CaptureError
+from dsar.geometry.camera_checks import check_names_differ, make_camera
 from dsar.geometry.frame_rates import same_rate
 from dsar.text import read_json
 from dsar.types import Body, Camera, Motion
@@ -47,9 +47,9 @@ def open_native(root: Path, body: Path | None = None) -> MultiViewCapture:
         _read_camera(entry, f"{where}, camera {k}")
         for k, entry in enumerate(_get(record, "cameras", list, where))
     ]
-    names = [camera.name for camera in cameras]
-    if not cameras or len(set(names)) != len(names):
-        raise CaptureError(f"{where}: expected at least one camera and names that differ, found {names}")
+    if not cameras:
+        raise CaptureError(f"{where}: expected at least one camera, found none: add the calibrated cameras")
+    check_names_differ(str(where), [camera.name for camera in cameras], CaptureError)
     fps = float(_get(record, "fps", (int, float), where))
     if not (math.isfinite(fps) and fps > 0):
         raise CaptureError(f"{where}: expected 'fps' as a number above 0, found {fps}")
@@ -116,12 +116,11 @@ def _get(record: Mapping[str, Any], key: str, kind: type[T] | tuple[type[T], ...
 
 
 def _read_camera(entry: Mapping[str, Any], where: str) -> Camera:
-    name = _get(entry, "name", str, where)
-    if not (name.isascii() and name.isidentifier()):
-        raise CaptureError(f"{where}: expected a name of letters, digits and _, found {name!r}")
-    matrices = {key: _get(entry, key, list, where) for key in ("K", "T_camera_world")}
-    size = _get(entry, "width", int, where), _get(entry, "height", int, where)
-    return make_camera(f"{where} {name}", name, matrices["K"], matrices["T_camera_world"], size)
+    if not isinstance(entry, dict):
+        raise CaptureError(f"{where}: expected name, K, T_camera_world, width and height, found {entry!r}")
+    K, T_camera_world = entry.get("K"), entry.get("T_camera_world")
+    name, size = entry.get("name"), (entry.get("width"), entry.get("height"))
+    return make_camera(f"{where} {name}", name, K, T_camera_world, size, CaptureError)
 
 
 def _read_betas(numbers: list[Any], where: Path) -> Float[Tensor, " s"]:

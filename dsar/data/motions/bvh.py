@@ -11,13 +11,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dsar.errors import MotionError
-from dsar.geometry.frame_rates import same_rate
+from dsar.geometry.frame_rates import exact_rate
 from dsar.geometry.rotations import matrix_from_axis_angle
 from dsar.text import decode_text
 
 _CHANNELS = {f"{axis}{kind}".lower(): f"{axis}{kind}" for axis in "XYZ" for kind in ("position", "rotation")}
 _POSITIONS = [f"{axis}position" for axis in "XYZ"]
-_STANDARD_RATES = (24000 / 1001, 30000 / 1001, 60000 / 1001, 120000 / 1001)
 _UNROTATED = 0.9
 """Share of a frame's rotations that are exactly zero: more are in a rest pose (CMU's turns legs and arms)."""
 LOGGER = logging.getLogger(__name__)
@@ -118,9 +117,7 @@ def _rate(path: Path, seconds: float) -> float:
             f"motion file {path}: the frame time {seconds:g} is not a finite number above 0 and "
             "below one second; say its frames per second with --motion-fps"
         )
-    fps = 1 / seconds
-    standard = next((rate for rate in _STANDARD_RATES if same_rate(fps, rate)), float(round(fps)))
-    return standard if same_rate(fps, standard) else fps
+    return float(exact_rate(1 / seconds))
 
 
 def _parse_hierarchy(text: str) -> Skeleton:

@@ -16,6 +16,7 @@ from torch import Tensor
 from dsar.atomic_files import atomic_write
 from dsar.data.motions.bvh import Skeleton, pose_skeleton, read_bvh
 from dsar.data.motions.joint_matching import JointMatch, match_joints
+from dsar.data.motions.kinematics import trace_joints
 from dsar.data.motions.retargeting import (
     SkeletonClip,
     body_joint_positions,
@@ -25,7 +26,7 @@ from dsar.data.motions.retargeting import (
     retarget,
 )
 from dsar.data.motions.smplx_npz import read_arrays, read_poses, read_rate
-from dsar.data.motions.up_axis import Up, UpAxis, detect_up_axis, joint_positions, rotation_to_y_up
+from dsar.data.motions.up_axis import Up, UpAxis, detect_up_axis, rotation_to_y_up
 from dsar.errors import MotionError
 from dsar.geometry.frame_rates import exact_rate, same_rate
 from dsar.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
@@ -74,7 +75,7 @@ def read_motion(
     arrays = read_arrays(path)
     rotations, translations = read_poses(path, arrays)
     filed = Motion(rotations, translations, fps or read_rate(path, arrays), path.stem)
-    found = _told_up_axis(up) or detect_up_axis(joint_positions(body, filed), "z")
+    found = _told_up_axis(up) or detect_up_axis(trace_joints(body, filed).positions, "z")
     _log_interpretation(path, found, f"{filed.fps:g} fps", level)
     return filed if found.axis == "y" else rotate_motion(filed, body, rotation_to_y_up(found.axis))
 

@@ -1,6 +1,7 @@
-"""How far a motion's poses are from those of training (paper equation 24)."""
+"""How far a motion's poses are from those of training."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -28,9 +29,9 @@ def median_distance(features: Float[Tensor, "n d"]) -> float:
 
 
 def mmd(x: Float[Tensor, "n d"], y: Float[Tensor, "m d"], bandwidth: float) -> float:
-    """Return the maximum mean discrepancy of two samples of at least two poses each.
+    """Return the maximum mean discrepancy of two samples of at least two poses each (paper equation 24).
 
-    The root of the unbiased estimate of MMD² (Gretton et al. 2012, equation 3) with the kernel
+    The root of the unbiased estimate of MMD² of Gretton et al. (2012) with the kernel
     exp(-d² / (2 bandwidth²)); 0 where that estimate is below zero. The paper gives no features, bandwidth or
     estimator: its limits of near (0.3) and far (0.6) need not fit these.
     """
@@ -46,10 +47,24 @@ def mmd(x: Float[Tensor, "n d"], y: Float[Tensor, "m d"], bandwidth: float) -> f
     return float(squared.clamp_min(0).sqrt())
 
 
-def motion_mmd(motions: Mapping[str, Motion], train: Sequence[str], names: Sequence[str]) -> float:
-    """Return how far the poses of some sequences are from those of training: the MMD, not its square."""
-    known, new = (torch.cat([pose_features(motions[name]) for name in group]) for group in (train, names))
-    return mmd(known, new, median_distance(known))
+@dataclass(frozen=True)
+class PoseDistribution:
+    """The poses of training, from which those of other motions are told apart."""
+
+    features: Float[Tensor, "n d"]
+    """Of each pose (`pose_features`)."""
+    bandwidth: float
+    """Of the kernel."""
+
+    @classmethod
+    def from_motions(cls, motions: Iterable[Motion]) -> "PoseDistribution":
+        """Return the distribution of all poses of some motions, at least two."""
+        features = torch.cat([pose_features(motion) for motion in motions])
+        return cls(features, median_distance(features))
+
+    def mmd(self, motions: Iterable[Motion]) -> float:
+        """Return how far the poses of other motions are from these: the MMD, not its square."""
+        return mmd(self.features, torch.cat([pose_features(motion) for motion in motions]), self.bandwidth)
 
 
 def label_sequences(
@@ -58,11 +73,12 @@ def label_sequences(
     """Return the test sequences that are near the training ones (`nd`) and far from them (`fd`), by MMD."""
     if sum(len(motions[name]) for name in splits["train"]) < 2:
         return {}
+    training = PoseDistribution.from_motions(motions[name] for name in splits["train"])
     labels: dict[str, tuple[str, ...]] = {}
     for name in splits["test"]:
         if len(motions[name]) > 1:
-            found = motion_mmd(motions, splits["train"], [name])
-            label = "nd" if found < NEAR else "fd" if found > FAR else None
+            distance = training.mmd([motions[name]])
+            label = "nd" if distance < NEAR else "fd" if distance > FAR else None
             if label:
                 labels[label] = (*labels.get(label, ()), name)
     return labels

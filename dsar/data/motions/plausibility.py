@@ -7,9 +7,9 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from dsar.body.model import JOINT_NAMES
-from dsar.data.motions.up_axis import joint_positions, trunk_and_leg_directions
+from dsar.data.motions.kinematics import JointTrajectories
+from dsar.data.motions.up_axis import trunk_and_leg_directions
 from dsar.errors import MotionError
-from dsar.types import Body, Motion
 
 _FLAT, _DOWN = 0.35, -0.35
 """Cosines with up: below the first the trunk lies, below the second the head is under the hips."""
@@ -24,17 +24,16 @@ _FLOATING, _SUNK, _FAR, _JUMP = 0.3, -0.15, 10.0, 15.0
 LOGGER = logging.getLogger(__name__)
 
 
-def check_plausibility(body: Body, motion: Motion) -> list[str]:
+def check_plausibility(motion: JointTrajectories) -> list[str]:
     """Return, and log as warnings, what looks wrong with a motion and what would mend it.
 
     Args:
-        body: Who moves.
-        motion: In the Y-up world.
+        motion: The body's joints in the Y-up world.
 
     Raises:
         MotionError: nobody can move like this: places are not finite, or the chest is on the legs throughout.
     """
-    joints = joint_positions(body, motion)
+    joints = motion.positions
     if not joints.isfinite().all():
         raise MotionError(f"motion {motion.name}: joints are not finite; the file or its skeleton is damaged")
     trunk, legs = trunk_and_leg_directions(joints)

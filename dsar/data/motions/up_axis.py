@@ -9,8 +9,6 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from dsar.body.model import JOINT_NAMES
-from dsar.body.skinning import forward_kinematics
-from dsar.types import Body, Motion
 
 Up = Literal["y", "z"]
 """What a user may say is up."""
@@ -43,12 +41,6 @@ class UpAxis:
     """In words, for the log."""
     certain: bool = True
     """False where the frames contradict each other, or the custom of the format."""
-
-
-def joint_positions(body: Body, motion: Motion) -> Float[Tensor, "f j 3"]:
-    """Return where the body's joints are in every frame, metres."""
-    transforms = forward_kinematics(body, motion.rotations, motion.translations)
-    return (transforms[..., :3, :3] @ body.joints[:, :, None])[..., 0] + transforms[..., :3, 3]
 
 
 def trunk_and_leg_directions(

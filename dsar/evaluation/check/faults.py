@@ -12,6 +12,13 @@ from torch import Tensor
 from dsar.body.model import FACE_JOINTS, JOINT_NAMES
 from dsar.data.motions.files import rotate_motion
 from dsar.evaluation.check.silhouettes import Hypothesis, Mask, silhouette_errors
+from dsar.geometry.camera_faults import (
+    CALIBRATION_FAULTS,
+    HALF_PIXEL_FAULTS,
+    CameraChange,
+    CameraFault,
+    shift_principal_point,
+)
 from dsar.geometry.rotations import matrix_from_axis_angle
 from dsar.types import Camera, Motion
 
@@ -50,18 +57,20 @@ class Candidate:
     """Mean error when mended."""
 
 
-def coarse_faults(turn: Float[Tensor, "3 3"]) -> Iterator[Fault]:
+def coarse_faults(R_world_file: Float[Tensor, "3 3"]) -> Iterator[Fault]:
     """Yield what shows in small images.
 
     Args:
-        turn: From the world of the capture's files to ours.
+        R_world_file: From the world of the capture's files to ours.
     """
-    yield from _camera_faults(torch.block_diag(turn, torch.ones(1, 1)))
+    yield from (_undo_camera_fault(fault, R_world_file) for fault in CALIBRATION_FAULTS)
     for factor, name in ((1e-3, "millimetres"), (1e-2, "centimetres"), (1e3, "kilometres")):
         yield Fault(
             f"motion_in_{name}",
             f"the motion's translations look like {name}: divide them by {1 / factor:g}",
-            _of_motions(lambda motion, hypothesis, factor=factor: _scaled(motion, hypothesis, factor, turn)),
+            _of_motions(
+                lambda motion, hypothesis, factor=factor: _scaled(motion, hypothesis, factor, R_world_file)
+            ),
         )
     for degrees in (90.0, -90.0, 180.0):
         for axis in ("X", "Z") if degrees != 180.0 else ("X", "Y", "Z"):
@@ -88,13 +97,7 @@ def coarse_faults(turn: Float[Tensor, "3 3"]) -> Iterator[Fault]:
 
 def half_pixel_faults() -> Iterator[Fault]:
     """Yield principal points that are off by half a pixel."""
-    for amount in (0.5, -0.5):
-        how = "whole numbers; add half a pixel" if amount > 0 else "halves already; take half a pixel off"
-        yield Fault(
-            f"half_pixel_{amount:+.1f}",
-            f"the principal points are half a pixel off: the calibration has pixel centres at {how}",
-            _of_cameras(lambda camera, amount=amount: _moved(camera, amount, amount)),
-        )
+    yield from (_undo_camera_fault(fault, torch.eye(3)) for fault in HALF_PIXEL_FAULTS)
 
 
 def hand_faults(hands: Float[Tensor, "2 45"] | None) -> Iterator[Fault]:
@@ -159,75 +162,23 @@ def is_significantly_smaller(before: Float[np.ndarray, " m"], after: Float[np.nd
 def control_hypotheses(hypothesis: Hypothesis) -> Iterator[Hypothesis]:
     """Yield readings as far off as half a pixel that no mistake explains: what a better fit alone gains."""
     for x, y in ((0.5, -0.5), (-0.5, 0.5)):
-        yield _of_cameras(lambda camera, x=x, y=y: _moved(camera, x, y))(hypothesis)
+        yield _of_cameras(shift_principal_point(x, y))(hypothesis)
 
 
-def _camera_faults(turn: Float[Tensor, "4 4"]) -> Iterator[Fault]:
-    def of_files(change: Callable[[Tensor], Tensor]) -> Callable[[Hypothesis], Hypothesis]:
-        """Change T_camera_world as the files have it."""
-        return _of_cameras(
-            lambda camera: dataclasses.replace(
-                camera, T_camera_world=change(camera.T_camera_world @ turn) @ turn.T
-            )
-        )
+def _undo_camera_fault(fault: CameraFault, R_world_file: Float[Tensor, "3 3"]) -> Fault:
+    """Return a camera fault with what undoes it in a hypothesis."""
+    (undo,) = fault.changes
+    T_world_file = torch.block_diag(R_world_file, torch.ones(1, 1))
 
-    yield Fault(
-        "camera_to_world",
-        "the extrinsics are camera to world: invert them",
-        of_files(torch.linalg.inv),
-    )
-    yield Fault(
-        "rotation_transposed",
-        "the cameras' rotations are transposed (rows for columns, or camera to world beside a "
-        "world-to-camera translation): transpose them",
-        of_files(lambda T: _rigid(T[:3, :3].T, T[:3, 3])),
-    )
-    yield Fault(
-        "camera_centers",
-        "the translations are the cameras' places: use -R times the place",
-        of_files(lambda T: _rigid(T[:3, :3], -T[:3, :3] @ T[:3, 3])),
-    )
-    for name, axes, what in (
-        ("opengl_axes", (1.0, -1.0, -1.0), "OpenGL's (y up, looking along -z): negate the rows of y and z"),
-        (
-            "pytorch3d_axes",
-            (-1.0, -1.0, 1.0),
-            "PyTorch3D's or Mitsuba's (x left, y up): negate the rows of x and y",
-        ),
-        ("mirrored_axes", (-1.0, 1.0, -1.0), "turned about y: negate the rows of x and z"),
-    ):
-        flip = torch.diag(torch.tensor([*axes, 1.0]))
-        yield Fault(
-            name,
-            f"the cameras' axes are {what}",
-            _of_cameras(
-                lambda camera, flip=flip: dataclasses.replace(
-                    camera, T_camera_world=flip @ camera.T_camera_world
-                )
-            ),
-        )
-    for factor, name in ((1e-3, "millimetres"), (1e-2, "centimetres"), (1e3, "kilometres")):
-        yield Fault(
-            f"cameras_in_{name}",
-            f"the cameras' translations look like {name}: divide them by {1 / factor:g}",
-            _of_cameras(lambda camera, factor=factor: _farther(camera, factor)),
-        )
-    for factor in (0.25, 0.5, 2.0, 4.0):
-        yield Fault(
-            f"intrinsics_times_{1 / factor:g}",
-            f"K is of images {1 / factor:g} times as large: multiply its first two rows by {factor:g}",
-            _of_cameras(lambda camera, factor=factor: _zoomed(camera, factor)),
-        )
-    for name, x, y, what in (
-        ("mirrored_images", -1, 1, "mirrored left to right: mirror them back"),
-        ("upside_down", -1, -1, "upside down: turn them by 180 degrees"),
-    ):
-        yield Fault(
-            name, f"the images are {what}", _of_cameras(lambda camera, x=x, y=y: _flipped(camera, x, y))
-        )
+    def undo_in_file_world(camera: Camera) -> Camera:
+        filed = undo(dataclasses.replace(camera, T_camera_world=camera.T_camera_world @ T_world_file))
+        return dataclasses.replace(filed, T_camera_world=filed.T_camera_world @ T_world_file.T)
+
+    change = undo_in_file_world if fault.in_file_world else undo
+    return Fault(fault.name, fault.description, _of_cameras(change))
 
 
-def _of_cameras(change: Callable[[Camera], Camera]) -> Callable[[Hypothesis], Hypothesis]:
+def _of_cameras(change: CameraChange) -> Callable[[Hypothesis], Hypothesis]:
     def undo(hypothesis: Hypothesis) -> Hypothesis:
         return dataclasses.replace(hypothesis, cameras={k: change(c) for k, c in hypothesis.cameras.items()})
 
@@ -243,10 +194,12 @@ def _of_motions(change: Callable[[Motion, Hypothesis], Motion]) -> Callable[[Hyp
     return undo
 
 
-def _scaled(motion: Motion, hypothesis: Hypothesis, factor: float, turn: Float[Tensor, "3 3"]) -> Motion:
-    filed = rotate_motion(motion, hypothesis.body, turn.T)
+def _scaled(
+    motion: Motion, hypothesis: Hypothesis, factor: float, R_world_file: Float[Tensor, "3 3"]
+) -> Motion:
+    filed = rotate_motion(motion, hypothesis.body, R_world_file.T)
     return rotate_motion(
-        dataclasses.replace(filed, translations=filed.translations * factor), hypothesis.body, turn
+        dataclasses.replace(filed, translations=filed.translations * factor), hypothesis.body, R_world_file
     )
 
 
@@ -263,35 +216,3 @@ def _with_hands(motion: Motion, hands: Float[Tensor, "f 30 3"]) -> Motion:
 
 def _indices(part: slice) -> range:
     return range(part.start, part.stop)
-
-
-def _rigid(rotation: Float[Tensor, "3 3"], translation: Float[Tensor, "3"]) -> Float[Tensor, "4 4"]:
-    transform = torch.eye(4)
-    transform[:3, :3], transform[:3, 3] = rotation, translation
-    return transform
-
-
-def _farther(camera: Camera, factor: float) -> Camera:
-    transform = camera.T_camera_world.clone()
-    transform[:3, 3] *= factor
-    return dataclasses.replace(camera, T_camera_world=transform)
-
-
-def _zoomed(camera: Camera, factor: float) -> Camera:
-    return dataclasses.replace(camera, K=camera.K * torch.tensor([[factor], [factor], [1.0]]))
-
-
-def _moved(camera: Camera, x: float, y: float) -> Camera:
-    K = camera.K.clone()
-    K[0, 2] += x
-    K[1, 2] += y
-    return dataclasses.replace(camera, K=K)
-
-
-def _flipped(camera: Camera, x: int, y: int) -> Camera:
-    K = camera.K.clone()
-    if x < 0:
-        K[0] = torch.tensor([0.0, 0.0, camera.width]) - K[0]
-    if y < 0:
-        K[1] = torch.tensor([0.0, 0.0, camera.height]) - K[1]
-    return dataclasses.replace(camera, K=K)

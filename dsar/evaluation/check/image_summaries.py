@@ -2,7 +2,7 @@
 
 import itertools
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from hashlib import blake2b
@@ -12,11 +12,11 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from dsar.avatar.driving import find_jumps
-from dsar.body.skinning import forward_kinematics
 from dsar.color import linear_from_srgb
 from dsar.data.captures.multiview import MultiViewCapture
-from dsar.data.motions.out_of_distribution import joint_speeds
+from dsar.data.motions.kinematics import JointTrajectories
 from dsar.errors import CaptureError
+from dsar.types import Body
 
 _THREADS = 2
 _MOVING = 0.05
@@ -93,10 +93,16 @@ def count_images(capture: MultiViewCapture) -> int:
     )
 
 
-def count_duplicates(capture: MultiViewCapture, summaries: Sequence[ImageSummary]) -> dict[int, int]:
-    """Return how many images of each camera equal the one before, though the body moved."""
-    speeds = {name: joint_speeds(capture.body, motion) for name, motion in capture.motions.items()}
-    moving = {name: (each > _MOVING).tolist() for name, each in speeds.items()}
+def count_duplicates(
+    joints: Mapping[str, JointTrajectories], summaries: Sequence[ImageSummary]
+) -> dict[int, int]:
+    """Return how many images of each camera equal the one before, though the body moved.
+
+    Args:
+        joints: The body's, by sequence.
+        summaries: Of all images, sequence by sequence and camera by camera.
+    """
+    moving = {name: (trajectories.speeds > _MOVING).tolist() for name, trajectories in joints.items()}
     counts: Counter[int] = Counter()
     for before, now in itertools.pairwise(summaries):
         follows = (before.sequence, before.camera, before.frame + 1) == (now.sequence, now.camera, now.frame)
@@ -105,13 +111,13 @@ def count_duplicates(capture: MultiViewCapture, summaries: Sequence[ImageSummary
     return dict(counts)
 
 
-def count_jumps(capture: MultiViewCapture) -> dict[str, list[int]]:
+def count_jumps(body: Body, joints: Mapping[str, JointTrajectories]) -> dict[str, list[int]]:
     """Return the frames of each sequence in which a body is where it cannot have come from."""
-    found = {}
-    for name, motion in capture.motions.items():
-        transforms = forward_kinematics(capture.body, motion.rotations, motion.translations)
-        found[name] = find_jumps(transforms, capture.body.joints[0], motion.fps)
-    return {name: frames for name, frames in found.items() if frames}
+    jumps = {
+        name: find_jumps(trajectories.transforms, body.joints[0], trajectories.fps)
+        for name, trajectories in joints.items()
+    }
+    return {name: frames for name, frames in jumps.items() if frames}
 
 
 def histogram(values: Float[Tensor, " n"]) -> dict[str, int]:

@@ -17,6 +17,7 @@ from jaxtyping import Float
 from pxr import Gf, Usd, UsdGeom
 
 from dsar.errors import ExportError
+from dsar.geometry.camera_checks import RIGID_TOLERANCE, distance_from_orthonormal
 from dsar.geometry.camera_paths import START_FRAME, CameraPath
 from dsar.geometry.frame_rates import exact_rate, same_rate
 from dsar.geometry.rotations import nearest_rotation
@@ -27,7 +28,6 @@ _logger = logging.getLogger(__name__)
 
 _FITS = 0.01
 """How far the aspects of aperture and picture may differ and mean the same: rounding to whole pixels."""
-_RIGID_TOLERANCE = 1e-4
 _Y_UP_FROM_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 _STATE = 5
 """Numbers of a lens, before the sixteen of its place."""
@@ -188,8 +188,7 @@ class _CameraReader:
         stage = self._prim.GetStage()
         axes, center = matrix[:3, :3].T, matrix[3, :3] * UsdGeom.GetStageMetersPerUnit(stage)
         scale = np.cbrt(np.linalg.det(axes))
-        deviation = np.abs(axes.T @ axes / max(scale * scale, 1e-30) - np.eye(3)).max()
-        if not (scale > 0 and deviation <= _RIGID_TOLERANCE):
+        if not (scale > 0 and distance_from_orthonormal(axes.T / scale) <= RIGID_TOLERANCE):
             lengths = ", ".join(f"{length:g}" for length in np.linalg.norm(axes, axis=0))
             raise ExportError(
                 f"{self._where}: expected it turned, moved and scaled alike in all directions, found it "

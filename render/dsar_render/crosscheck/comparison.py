@@ -9,12 +9,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dsar.geometry.camera_faults import PROJECTION_FAULTS, explain_projection
 from dsar.geometry.cameras import farthest_cameras, look_at
 from dsar.raster import rasterize
 from dsar.types import Camera, Gaussians
 from dsar_render.crosscheck import proxies, splats
 from dsar_render.crosscheck.backend import LLVM
-from dsar_render.crosscheck.mistakes import MISTAKES, name_mistake
 from dsar_render.crosscheck.points import (
     Projection,
     Residuals,
@@ -102,12 +102,12 @@ def seed_mistakes(mi: Any, camera: Camera) -> dict[str, str | None]:
     probe = Camera(K, _roll(T, 0.2), width, height, "probe")
     observations = project_spheres(mi, probe)
     return {
-        mistake.name: find_mistake(probe, observations, camera_projection(mistake.variants[0](probe)))
-        for mistake in MISTAKES
+        fault.name: find_fault(probe, observations, camera_projection(fault.changes[0](probe)))
+        for fault in PROJECTION_FAULTS
     }
 
 
-def find_mistake(camera: Camera, observations: SphereObservations, source: Projection) -> str | None:
+def find_fault(camera: Camera, observations: SphereObservations, source: Projection) -> str | None:
     """Return the mistake that a projection has made, `unknown` if it is none of the usual; None if none.
 
     Args:
@@ -120,7 +120,7 @@ def find_mistake(camera: Camera, observations: SphereObservations, source: Proje
     # Where Mitsuba itself sees them elsewhere, the mistake is in what it was told.
     ours = Residuals.from_distances(observations.residuals(camera_projection(camera)))
     pixels = source(observations.points) if ours.rms <= TOLERANCE_PX else observations.pixels
-    mistake = name_mistake(camera, observations.points, pixels, TOLERANCE_PX)
+    mistake = explain_projection(camera, observations.points, pixels, TOLERANCE_PX)
     return mistake.name if mistake else "unknown"
 
 
@@ -130,7 +130,7 @@ def _compare_camera(
     residuals = {
         name: Residuals.from_distances(observations.residuals(source)) for name, source in sources.items()
     }
-    faults = {name: find_mistake(camera, observations, source) for name, source in sources.items()}
+    faults = {name: find_fault(camera, observations, source) for name, source in sources.items()}
     mistakes = {name: fault for name, fault in faults.items() if fault is not None}
     return CameraVerdict(camera.name, residuals, mistakes, proxy)
 

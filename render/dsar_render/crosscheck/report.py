@@ -9,7 +9,7 @@ from jinja2 import Environment, StrictUndefined
 from PIL import Image
 
 from dsar.atomic_files import atomic_write
-from dsar_render.crosscheck.mistakes import MISTAKES
+from dsar.geometry.camera_faults import PROJECTION_FAULTS
 from dsar_render.crosscheck.oracle import STEPS
 from dsar_render.crosscheck.verdict import Verdict
 
@@ -20,7 +20,7 @@ def write_crosscheck_report(verdict: Verdict, path: Path) -> Path:
     source = Path(__file__).with_name("report.html.jinja").read_text(encoding="utf-8")
     facts = {
         "verdict": verdict,
-        "descriptions": {mistake.name: mistake.description for mistake in MISTAKES}
+        "descriptions": {fault.name: fault.description for fault in PROJECTION_FAULTS}
         | {"unknown": "none of the usual mistakes"},
         "steps": STEPS,
         "pictures": {name: [_embedded(image) for image in row] for name, row in verdict.pictures.items()},

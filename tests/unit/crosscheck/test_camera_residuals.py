@@ -9,12 +9,12 @@ import torch
 from any_camera import random_camera
 
 from dsar.errors import ConfigError
+from dsar.geometry.camera_faults import PROJECTION_FAULTS, explain_projection
 from dsar.geometry.cameras import project
 from dsar_exporters import read_back_projections, write_usd
 from dsar_exporters.projections import _single_gaussian as speck
 from dsar_exporters.usd import read_usd_projections
-from dsar_render.crosscheck.comparison import TOLERANCE_PX, find_mistake, seed_mistakes
-from dsar_render.crosscheck.mistakes import MISTAKES, name_mistake
+from dsar_render.crosscheck.comparison import TOLERANCE_PX, find_fault, seed_mistakes
 from dsar_render.crosscheck.points import (
     Residuals,
     SphereObservations,
@@ -35,16 +35,16 @@ def test_valid_cameras_agree_to_a_twentieth_of_a_pixel(scalar, seed):
     found = Residuals.from_distances(observations.residuals(camera_projection(camera)))
     assert found.rms < 0.03
     assert found.max < 0.08
-    assert find_mistake(camera, observations, camera_projection(camera)) is None
+    assert find_fault(camera, observations, camera_projection(camera)) is None
 
 
 def test_a_large_camera_agrees_as_well_though_it_is_looked_through_at_1024_pixels(scalar, oblong):
     large = oblong.resized(32 * oblong.width, 24 * oblong.height)
     observations = project_spheres(scalar, large)
     assert Residuals.from_distances(observations.residuals(camera_projection(large))).rms < 0.05
-    shifted = MISTAKES[0].variants[0](large)
-    assert find_mistake(large, observations, camera_projection(large)) is None
-    assert find_mistake(large, observations, camera_projection(shifted)) == "half_pixel_shift"
+    shifted = PROJECTION_FAULTS[0].changes[0](large)
+    assert find_fault(large, observations, camera_projection(large)) is None
+    assert find_fault(large, observations, camera_projection(shifted)) == "half_pixel_shift"
 
 
 def test_files_project_as_mitsuba_sees(scalar, oblong):
@@ -71,14 +71,14 @@ def test_seeded_mistakes_are_caught_and_named(scalar, oblong):
     assert found == {name: name for name in found}
 
 
-@pytest.mark.parametrize("mistake", MISTAKES, ids=lambda mistake: mistake.name)
+@pytest.mark.parametrize("mistake", PROJECTION_FAULTS, ids=lambda mistake: mistake.name)
 def test_every_way_to_make_a_mistake_has_its_name(mistake):
     for seed in range(5):
         camera = random_camera(seed)
         points, _ = place_spheres(camera, seed)
-        for make in mistake.variants:
+        for make in mistake.changes:
             places, _ = project(make(camera), points)
-            found = name_mistake(camera, points, places, TOLERANCE_PX)
+            found = explain_projection(camera, points, places, TOLERANCE_PX)
             assert found is not None
             assert found.name == mistake.name
 
@@ -106,10 +106,8 @@ def test_mistakes_in_matrices_made_by_hand_are_named(scalar, oblong):
         "camera_to_world": matrix(K, np.linalg.inv(T)),
         "centimetres": matrix(K, np.hstack([T[:, :3], T[:, 3:] * [[100], [100], [100], [1]]])),
     }
-    assert find_mistake(oblong, observations, matrix_projection(matrix(K, T))) is None
-    found = {
-        name: find_mistake(oblong, observations, matrix_projection(each)) for name, each in wrong.items()
-    }
+    assert find_fault(oblong, observations, matrix_projection(matrix(K, T))) is None
+    found = {name: find_fault(oblong, observations, matrix_projection(each)) for name, each in wrong.items()}
     assert found == {name: name for name in wrong}
 
 
@@ -122,12 +120,12 @@ def test_a_stage_that_says_it_is_in_other_units_is_caught(scalar, oblong, tmp_pa
     sizes = {"oblong": (oblong.width, oblong.height)}
     observations = project_spheres(scalar, oblong)
     right = matrix_projection(read_usd_projections(path, sizes)["oblong"])
-    assert find_mistake(oblong, observations, right) is None
+    assert find_fault(oblong, observations, right) is None
     stage = Usd.Stage.Open(str(path))
     UsdGeom.SetStageMetersPerUnit(stage, 0.01)
     stage.Save()
     wrong = matrix_projection(read_usd_projections(path, sizes)["oblong"])
-    assert find_mistake(oblong, observations, wrong) == "centimetres"
+    assert find_fault(oblong, observations, wrong) == "centimetres"
 
 
 def test_cameras_may_have_any_names(oblong):
@@ -141,13 +139,13 @@ def test_what_is_no_usual_mistake_is_unknown(scalar, oblong):
     turned[:3, 3] += torch.tensor([0.02, 0.0, 0.01])
     observations = project_spheres(scalar, oblong)
     wrong = dataclasses.replace(oblong, T_camera_world=turned)
-    assert find_mistake(oblong, observations, camera_projection(wrong)) == "unknown"
+    assert find_fault(oblong, observations, camera_projection(wrong)) == "unknown"
 
 
 def test_a_mistake_in_what_mitsuba_was_told_is_named_too(scalar, oblong):
-    shifted = MISTAKES[0].variants[0](oblong)
+    shifted = PROJECTION_FAULTS[0].changes[0](oblong)
     observations = project_spheres(scalar, shifted)
-    assert find_mistake(oblong, observations, camera_projection(oblong)) == "half_pixel_shift"
+    assert find_fault(oblong, observations, camera_projection(oblong)) == "half_pixel_shift"
 
 
 def test_points_that_mitsuba_does_not_see_are_infinitely_far(scalar, oblong):

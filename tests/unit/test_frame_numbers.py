@@ -1,7 +1,7 @@
 import pytest
 
 from dsar.errors import ConfigError
-from dsar_exporters import parse_frames
+from dsar.geometry.frame_numbers import parse_frames
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Frame ranges as film pipelines write them."""
+"""Frames as people name them: numbers of a delivery as film pipelines write them, and stretches of a take."""
 
 from fileseq.exceptions import FileSeqException
 from fileseq.frameset import FrameSet
@@ -26,3 +26,17 @@ def parse_frames(text: str) -> list[int]:
     if any(frame != int(frame) for frame in frames):
         raise ConfigError(f"frames: expected whole frame numbers, found fractions in {text!r}")
     return sorted(int(frame) for frame in frames)
+
+
+def parse_frame_range(text: str | None, count: int) -> range:
+    """Return the frames of a take of `count` that a stretch such as 0-239, or one number, names; None: all.
+
+    Raises:
+        ConfigError: the text is no such stretch.
+    """
+    if text is None:
+        return range(count)
+    first, _, last = text.partition("-")
+    if not (first.isdigit() and (last or first).isdigit()):
+        raise ConfigError(f"frame range {text!r} is not of the form 0-239")
+    return range(min(int(first), count), min(int(last or first) + 1, count))
