@@ -12,7 +12,7 @@ from dsar.errors import ConfigError
 from dsar.geometry.camera_faults import PROJECTION_FAULTS, explain_projection
 from dsar.geometry.cameras import project
 from dsar_exporters import read_back_projections, write_usd
-from dsar_exporters.projections import _speck as speck
+from dsar_exporters.projections import _single_gaussian as speck
 from dsar_exporters.usd import read_usd_projections
 from dsar_render.crosscheck.comparison import TOLERANCE_PX, find_fault, seed_mistakes
 from dsar_render.crosscheck.points import (
@@ -107,9 +107,7 @@ def test_mistakes_in_matrices_made_by_hand_are_named(scalar, oblong):
         "centimetres": matrix(K, np.hstack([T[:, :3], T[:, 3:] * [[100], [100], [100], [1]]])),
     }
     assert find_fault(oblong, observations, matrix_projection(matrix(K, T))) is None
-    found = {
-        name: find_fault(oblong, observations, matrix_projection(each)) for name, each in wrong.items()
-    }
+    found = {name: find_fault(oblong, observations, matrix_projection(each)) for name, each in wrong.items()}
     assert found == {name: name for name in wrong}
 
 
