@@ -99,7 +99,8 @@ def _read_record(where: Path) -> dict[str, Any]:
     version = (record.get("format"), record.get("version")) if isinstance(record, dict) else (None, None)
     if version != (FORMAT, VERSION):
         raise CaptureError(
-            f"{where}: expected format {FORMAT!r} version {VERSION}, found {version[0]!r} version {version[1]!r}"
+            f"{where}: expected format {FORMAT!r} version {VERSION}, "
+            f"found {version[0]!r} version {version[1]!r}"
         )
     return record
 
