@@ -30,6 +30,7 @@ from dsar.data.images import decoding
 from dsar.training.chunk import ChunkTrainer
 from dsar.training.loop import training_clips
 from dsar.training.schedule import schedule_at
+from dsar.training.state import TrainingState
 from dsar.training.targets import Target, TargetLoader, load_target
 
 SEQUENCE, SCALE = "sway", 8
@@ -126,7 +127,10 @@ def measure(capture: MultiViewCapture, updates: int) -> dict:
     config = PRESETS["demo"]
     config = dataclasses.replace(config, atlas=dataclasses.replace(config.atlas, garment="off"))
     avatar = Avatar.from_capture(capture, capture.body, config.atlas, config.model)
-    trainer = ChunkTrainer(config, capture, avatar.train(), training_clips(capture), None)
+    clips = training_clips(capture)
+    state = TrainingState.begin(config, capture, avatar.train(), clips, [])
+    signals = {name: avatar.driving_signal(capture.motions[name]) for name in clips}
+    trainer = ChunkTrainer(config, capture, state, signals, None)
     now, ahead = schedule_at(config.schedule, LATE), Timed(capture)
     seconds: dict[str, list[float]] = {"at_once": [], "ahead": []}
     for update in range(-2, updates):

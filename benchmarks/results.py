@@ -1,13 +1,11 @@
 """The file that a benchmark leaves."""
 
 import json
-import os
 from pathlib import Path
+
+from dsar.atomic_files import write_text_atomically
 
 
 def write_json(found: dict, path: Path) -> None:
     """Write what was found, whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(".tmp")
-    temporary.write_text(json.dumps(found, indent=2))
-    os.replace(temporary, path)
+    write_text_atomically(path, json.dumps(found, indent=2))

@@ -8,6 +8,7 @@ is trained without it makes up for some of it.
 """
 
 import argparse
+import dataclasses
 import json
 import statistics
 from pathlib import Path
@@ -19,9 +20,10 @@ from dsar.avatar.avatar import Avatar
 from dsar.avatar.rollout import START_FRAME, network_outputs, roll_out
 from dsar.data.captures.formats import capture_of
 from dsar.data.captures.multiview import MultiViewCapture
-from dsar.evaluation.heldout import compare, evaluate_sequence, one_to_many
 from dsar.evaluation.looping import loop_motion
+from dsar.evaluation.one_to_many import one_to_many
 from dsar.evaluation.settling import rms_speeds, settling_time
+from dsar.evaluation.view_metrics import compare, evaluate_sequence
 from dsar.evaluation.views import render_white, true_view
 from dsar.training.checkpoint import Run, load_checkpoint
 
@@ -39,8 +41,9 @@ def measure_streams(avatar: Avatar, capture: MultiViewCapture, stride: int) -> d
         for sequence in capture.splits["test"]:
             rows = evaluate_sequence(avatar, capture, sequence, stride, streams=streams)
             for key in ("psnr", "psnr_box", "psnr_box_template"):
-                row[f"{sequence}.{key}"] = statistics.fmean(each[key] for each in rows)
-        found[name] = row | {"one_to_many": one_to_many(avatar, capture, streams=streams)}
+                row[f"{sequence}.{key}"] = statistics.fmean(getattr(view, key) for view in rows)
+        pairs = one_to_many(avatar, capture, streams=streams)
+        found[name] = row | {"one_to_many": None if pairs is None else dataclasses.asdict(pairs)}
     return found
 
 
@@ -86,7 +89,7 @@ def measure_horizon(
         frame, index = chosen[number], (number - START_FRAME) // period
         for k, camera in enumerate(capture.cameras):
             image = render_white(gaussians, camera)
-            psnr = compare(image, image, true_view(capture, sequence, frame, k))["psnr_box"]
+            psnr = compare(frame, k, image, image, true_view(capture, sequence, frame, k)).psnr_box
             errors.setdefault(index, []).append(10 ** (-psnr / 10))
     rms = {str(h): statistics.fmean(errors[index]) ** 0.5 for h, index in rounds.items()}
     return {"clip": clip, "rounds": rounds, "rms": rms, "frames": len(long)}

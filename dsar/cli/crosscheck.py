@@ -63,17 +63,17 @@ class Crosscheck(RunCommand):
         capture, body, drive, page = self.open()
         shapes = [self.posed(capture, body)]
         cameras = list(capture.cameras)
-        written = read_back_projections(cameras)
+        projections = read_back_projections(cameras)
         mi = load_mitsuba(self.variant)
         gaussians = drive() if drive else None
         if gaussians is not None:
             shapes.append(ellipsoids(gaussians))
         with ProgressBar(self.progress, "crosscheck").running() as bar:
             verdict = cross_check(
-                *(mi, cameras, written, shapes, gaussians), lambda what, share: bar.show(share, what)
+                *(mi, cameras, projections, shapes, gaussians), lambda what, share: bar.show(share, what)
             )
         page = write_crosscheck_report(verdict, self.report or page)
-        figures = verdict.to_json()
+        figures = verdict.figures.to_json()
         self.write_json(figures | {"report": str(page)})
         for key in ("camera_px_rms", "camera_px_max", "silhouette_iou", "depth_mae_m", "splat_psnr"):
             sys.stdout.write(f"{key}: {figures[key]}\n")

@@ -4,9 +4,12 @@ import importlib.util
 import logging
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from dsar.cli.command import resolve_sequence
+
+if TYPE_CHECKING:
+    from dsar.evaluation.results import WorstView
 
 _log = logging.getLogger(__name__)
 _COLUMNS = 10
@@ -67,18 +70,18 @@ def write_comparison(folder: Path) -> Path:
     return path
 
 
-def write_worst(folder: Path, views: Sequence[dict[str, Any]]) -> Path:
+def write_worst(folder: Path, views: "Sequence[WorstView]") -> Path:
     """Write truth above prediction for views of held-out sequences."""
     from dsar_render import write_contact_sheet
 
     scene, pairs = _Scene(folder), {}
-    for name in dict.fromkeys(view["sequence"] for view in views):
-        wanted = [(view["frame"], view["camera"]) for view in views if view["sequence"] == name]
-        cameras = sorted({camera for _, camera in wanted})
-        for frame, camera, image in scene.images(name, sorted({frame for frame, _ in wanted}), cameras):
+    for name in dict.fromkeys(view.sequence for view in views):
+        wanted = {(view.frame, view.camera) for view in views if view.sequence == name}
+        frames, cameras = (sorted({pair[axis] for pair in wanted}) for axis in (0, 1))
+        for frame, camera, image in scene.images(name, frames, cameras):
             if (frame, camera) in wanted:
                 pairs[name, frame, camera] = (scene.truth(name, frame, camera), image)
-    order = [(view["sequence"], view["frame"], view["camera"]) for view in views]
+    order = [(view.sequence, view.frame, view.camera) for view in views]
     rows = {who: [pairs[view][i] for view in order] for i, who in enumerate(("truth", "dsar"))}
     columns = [
         f"{name} {scene.first + frame} {scene.capture.cameras[camera].name}" for name, frame, camera in order

@@ -90,7 +90,7 @@ class Train(Common):
         run = Run(self.folder)
         if not run.exists:
             return "no checkpoint was written yet"
-        step = read_progress(run)["step"]
+        step = read_progress(run).step
         return f"training is saved up to update {step} in {run.checkpoint}; --resume goes on from there"
 
     def run(self) -> None:
@@ -116,5 +116,5 @@ class Train(Common):
 
             train(config, run, resume=self.resume, report=report)
         sheet = write_previews(run.folder)
-        reached = dataclasses.asdict(last[-1]) if last else read_progress(run)
+        reached = dataclasses.asdict(last[-1] if last else read_progress(run))
         self.write_json({"run": str(run.folder), "sheet": str(sheet), **reached})

@@ -11,6 +11,7 @@ from torch import Tensor
 from dsar.avatar.avatar import Avatar
 from dsar.avatar.rollout import roll_out, template_sequence
 from dsar.data.captures.multiview import MultiViewCapture
+from dsar.evaluation.results import GarmentFigures
 from dsar.geometry.cameras import project
 from dsar.types import Camera
 
@@ -110,13 +111,12 @@ def garment_mask(
 @torch.no_grad()
 def measure_garment(
     avatar: Avatar, capture: MultiViewCapture, sequence: str, stride: int
-) -> dict[str, dict[str, float]] | None:
-    """Return the garment's figures on every `stride`-th frame, metres; None without truth or a chart.
+) -> dict[str, GarmentFigures] | None:
+    """Return the garment's figures on every `stride`-th frame; None without truth or a chart.
 
     Beside the prediction: `template` is the garment at rest under skinning alone, what a model without any
     history gives; `second` is another simulation of the same motion, begun from a slightly different state:
-    what cannot be predicted. `hem_radius` and `hem_height` are root mean square errors over frames, `jitter`
-    is the mean jerk of the points in m/s³ over all frames; that of the `truth` is what it should be.
+    what cannot be predicted. `jitter` is over all frames; that of the `truth` is what it should be.
     """
     runs, garment = capture.garment_runs(sequence), avatar.garment_texels()
     if not runs or not len(garment):
@@ -127,18 +127,19 @@ def measure_garment(
     lowest, hem = (rows == avatar.garments[-1].rows[-1]).nonzero().squeeze(1), hem_loop(truth[0], faces)
     motion = capture.motions[sequence]
     rollout = roll_out(avatar, motion)
-    films = {"predicted": rollout, "template": template_sequence(rollout, avatar, motion)}
+    sequences = {"predicted": rollout, "template": template_sequence(rollout, avatar, motion)}
     clouds = {
-        name: (torch.stack([g.means[garment] for _, g in each]), lowest) for name, each in films.items()
+        name: (torch.stack([gaussians.means[garment] for _, gaussians in frames]), lowest)
+        for name, frames in sequences.items()
     }
     if runs > 1:
         clouds["second"] = (torch.from_numpy(capture.garment(sequence, run=1)), hem)
     clouds["truth"] = (truth, hem)
     return {
-        name: {
+        name: GarmentFigures(
             **_summarize(points[::stride], border, truth[::stride], faces, hem),
-            "jitter": measure_jitter(points, motion.fps),
-        }
+            jitter=measure_jitter(points, motion.fps),
+        )
         for name, (points, border) in clouds.items()
     }
 
@@ -150,12 +151,12 @@ def _summarize(
     faces: Int64[Tensor, "t 3"],
     hem: Int64[Tensor, " h"],
 ) -> dict[str, float]:
-    found, errors = [], []
+    shapes, errors = [], []
     for points, vertices in zip(clouds, truth, strict=True):
-        found.append(measure_shape(points, vertices, faces))
+        shapes.append(measure_shape(points, vertices, faces))
         radius, height = measure_hem(points[border])
         true_radius, true_height = measure_hem(vertices[hem])
         errors.append(((radius - true_radius) ** 2, (height - true_height) ** 2))
-    means = {name: statistics.fmean(each[name] for each in found) for name in found[0]}
+    means = {name: statistics.fmean(shape[name] for shape in shapes) for name in shapes[0]}
     radius, height = (statistics.fmean(column) ** 0.5 for column in zip(*errors, strict=True))
     return means | {"hem_radius": radius, "hem_height": height}

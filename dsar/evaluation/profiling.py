@@ -1,24 +1,33 @@
-"""The network's work taken apart: encoding, attention and decoding."""
+"""A frame's work taken apart: the network's encoding, attention and decoding, posing, rasterisation."""
 
+import statistics
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Any, TypeVar
 
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
+from dsar.avatar.avatar import Avatar
+from dsar.evaluation.results import FrameTimes
+from dsar.evaluation.views import render_white
 from dsar.network import DualStreamNetwork
+from dsar.network.session import InferenceSession
+from dsar.types import Capture
 
 T = TypeVar("T")
+_WARM_UP = 10
+"""Frames before times count."""
 Interceptor = Callable[[str, Callable[[], Any]], Any]
 """Is given a part's name and a call of it, and returns what the call returns."""
 
 
 @contextmanager
 def intercept_stages(network: DualStreamNetwork, interceptor: Interceptor) -> Iterator[None]:
-    """Have every call into the encoder (`encode`) and the decoder (`decode`) go through a watcher."""
+    """Have every call into the encoder (`encode`) and the decoder (`decode`) go through an interceptor."""
     encoder, decoder = network.encoder, network.decoder
     calls = [
         (encoder, "encode_frame", "encode"),
@@ -71,6 +80,37 @@ def count_stage_flops(network: DualStreamNetwork, step: Callable[[], object]) ->
     with FlopCounterMode(display=False) as counter, intercept_stages(network, interceptor):
         step()
     return _with_attention(flops, counter.get_total_flops(), 1e-9)
+
+
+@torch.no_grad()
+def time_rollout(avatar: Avatar, capture: Capture, sequence: str, frames: int = 100) -> FrameTimes:
+    """Return the milliseconds of the network's parts, posing and rasterisation of one camera.
+
+    The first frames are left out. Posing includes the input maps, which are posed control points.
+    """
+    signal = avatar.driving_signal(capture.motions[sequence])
+    session = InferenceSession(avatar.network)
+    times: dict[str, list[float]] = defaultdict(list)
+    for frame in range(_WARM_UP + frames):
+        start = read_clock()
+        motion_window = signal.windows[[frame % len(signal)]]
+        maps, magnitude = avatar.standardize(avatar.input_maps(motion_window, avatar.fps))
+        network_start = read_clock()
+        step = partial(session.step, maps, magnitude)
+        output, stages = time_stages(session.network, step)
+        network_end = read_clock()
+        gaussians = avatar.gaussians(motion_window, output)[0]
+        posed = read_clock()
+        render_white(gaussians, capture.cameras[0])
+        posing = network_start - start + posed - network_end
+        stages |= {"pose": 1e3 * posing, "raster": 1e3 * (read_clock() - posed)}
+        for name, milliseconds in stages.items():
+            times[name].append(milliseconds)
+    steady = {name: values[_WARM_UP:] for name, values in times.items() if name != "total"}
+    return FrameTimes(
+        {name: statistics.median(values) for name, values in steady.items()},
+        {name: statistics.quantiles(values, n=20)[-1] for name, values in steady.items()},
+    )
 
 
 def read_clock() -> float:

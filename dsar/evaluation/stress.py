@@ -62,6 +62,24 @@ class CaseVerdict:
         return verdict | {"present": self.present, "curve": curve}
 
 
+@dataclass(frozen=True)
+class BatteryVerdict:
+    """What all cases found."""
+
+    cases: Mapping[str, CaseVerdict]
+    """By the case's name."""
+
+    @property
+    def survived(self) -> int:
+        """How many cases hold."""
+        return sum(verdict.passed for verdict in self.cases.values())
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the verdicts for a results file."""
+        cases = {name: verdict.to_json() for name, verdict in self.cases.items()}
+        return {"cases": cases, "survived": self.survived, "tried": len(cases)}
+
+
 Case = Callable[[Avatar, Motion], CaseVerdict]
 
 

@@ -1,4 +1,4 @@
-"""Equations 4 to 16 of the paper (section 3.4) as they stand there: no cache, no variants, nothing fused.
+"""The paper's dual-stream architecture (section 3.4) as its text reads: no cache, no variants, nothing fused.
 
 It defines what `dsar.network` must compute, for training's step and the inference session alike, and reads
 from top to bottom beside the paper. Every frame of the window is encoded at every step, all rows of the
@@ -23,11 +23,6 @@ from dsar.network.model import OFFSET_UNIT, DualStreamNetwork, NetworkOutput
 from dsar.network.temporal import TemporalAggregation, TemporalAttention
 
 T = TypeVar("T")
-
-
-def motion_magnitude(velocity: Float[Tensor, "*b 3 h w"]) -> Float[Tensor, "*b 1 h w"]:
-    """Return V[u, v] = |dp[u, v]|_2 (equation 6), in the unit of the velocities."""
-    return velocity.square().sum(-3, keepdim=True).sqrt()
 
 
 class ReferenceNetwork(nn.Module):
@@ -99,16 +94,10 @@ class ReferenceNetwork(nn.Module):
             levels.append(convolve_twice(block, levels[-1]))
         return [level.unflatten(0, inputs.shape[:2]) for level in levels]
 
-    def enhance(
-        self, features: Float[Tensor, "b n d hL wL"], magnitudes: Float[Tensor, "b n 1 h w"]
-    ) -> Float[Tensor, "b n d hL wL"]:
-        """Return f~^L_tau = f^L_tau + m_tau + e_tau (equation 8)."""
-        position_embeddings = self.network.attention.position_embedding[:, :, None, None]
-        return (
-            features
-            + self.embed_motion(magnitudes, (features.shape[-2], features.shape[-1]))
-            + position_embeddings
-        )
+    @staticmethod
+    def motion_magnitude(velocity: Float[Tensor, "*b 3 h w"]) -> Float[Tensor, "*b 1 h w"]:
+        """Return V[u, v] = |dp[u, v]|_2 (equation 6), in the unit of the velocities."""
+        return velocity.square().sum(-3, keepdim=True).sqrt()
 
     def embed_motion(
         self, magnitudes: Float[Tensor, "b n 1 h w"], size: tuple[int, int]
@@ -119,6 +108,13 @@ class ReferenceNetwork(nn.Module):
         pooled = adaptive_avg_pool2d(magnitudes.flatten(0, 1), size)
         x, out = convolve_twice(motion_embedding.block, pooled), motion_embedding.out
         return conv2d(x, out.weight, out.bias, padding=1).unflatten(0, magnitudes.shape[:2])
+
+    def enhance(
+        self, features: Float[Tensor, "b n d hL wL"], magnitudes: Float[Tensor, "b n 1 h w"]
+    ) -> Float[Tensor, "b n d hL wL"]:
+        """Return f~^L_tau = f^L_tau + m_tau + e_tau (equation 8)."""
+        motion = self.embed_motion(magnitudes, (features.shape[-2], features.shape[-1]))
+        return features + motion + self.network.attention.position_embedding[:, :, None, None]
 
     def attend_causally(self, tokens: Float[Tensor, "b n d h w"]) -> Float[Tensor, "b d h w"]:
         """Return A_t, the newest row of the causal self-attention over the window (equations 9, 10, 11)."""

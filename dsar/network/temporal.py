@@ -30,8 +30,8 @@ class MotionEmbedding(nn.Module):
 class TemporalAttention(nn.Module):
     """Multi-head attention of frames to frames, at each pixel by itself.
 
-    A learnt embedding of a frame's position in time is part of what its key and value are made of. Both are
-    linear, so they can be projected once and given the position's share as they grow older.
+    A learnt embedding of a frame's position in time is added to it. Keys and values are linear, so a frame is
+    projected once, without the embedding, and the position's share is added where it is attended to.
     """
 
     def __init__(self, channels: int, heads: int, length: int) -> None:

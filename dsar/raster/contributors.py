@@ -16,21 +16,21 @@ def find_first_hit_depth(contributors: Contributors, depths: Float[Tensor, " n"]
     """
     counts = contributors.counts.flatten()
     hit, starts = counts > 0, counts.cumsum(0) - counts
-    found = depths.new_zeros(len(counts))
-    found[hit] = depths[contributors.ids[starts[hit]]]
-    return found.view(contributors.counts.shape)
+    first_depths = depths.new_zeros(len(counts))
+    first_depths[hit] = depths[contributors.ids[starts[hit]]]
+    return first_depths.view(contributors.counts.shape)
 
 
 def find_largest_weight_id(contributors: Contributors) -> Int[Tensor, "h w"]:
-    """Return the Gaussian with each pixel's largest share, the foremost of equals, -1 where there is none."""
+    """Return the Gaussian of each pixel's largest weight, the foremost of equals, -1 where there is none."""
     counts = contributors.counts.flatten()
     pixels = torch.arange(len(counts), device=counts.device).repeat_interleave(counts)
     weights = contributors.weights
     largest = weights.new_zeros(len(counts)).scatter_reduce(0, pixels, weights, "amax")
-    places = torch.arange(len(weights), device=counts.device)
+    positions = torch.arange(len(weights), device=counts.device)
     beyond = len(weights)
     first = torch.full_like(counts, beyond).scatter_reduce(
-        0, pixels, torch.where(weights == largest[pixels], places, beyond), "amin"
+        0, pixels, torch.where(weights == largest[pixels], positions, beyond), "amin"
     )
     ids = torch.cat([contributors.ids, contributors.ids.new_full((1,), -1)])
     return ids[first].view(contributors.counts.shape)

@@ -20,6 +20,7 @@ from torch.autograd.function import once_differentiable
 
 from dsar.errors import RasterError
 from dsar.raster.conventions import EPS_2D
+from dsar.raster.kernels_auxiliary import composite_auxiliary_part
 from dsar.raster.kernels_binning import (
     FIRST_ROWS,
     count_intersections_part,
@@ -28,8 +29,9 @@ from dsar.raster.kernels_binning import (
     reduce_sums_part,
     sort_by_depth,
 )
-from dsar.raster.kernels_compositing import composite_auxiliary_part, composite_backward_part, composite_part
-from dsar.raster.kernels_projection import project_backward_part, project_part
+from dsar.raster.kernels_compositing import composite_backward_part, composite_part
+from dsar.raster.kernels_projection import project_part
+from dsar.raster.kernels_projection_backward import project_backward_part
 from dsar.raster.kernels_shading import shade_backward_part, shade_part
 from dsar.raster.parallel import part_count, run_parts
 from dsar.raster.tiles import RECORD_SIZE, SUMS_SIZE, TILE
@@ -37,7 +39,7 @@ from dsar.types import Camera, Contributors, Gaussians, RenderOutput
 
 _log = logging.getLogger(__name__)
 _MAX_PAIRS = 2**28
-"""Places are 32-bit, and a backward pass keeps 52 bytes a pair: this many would take 14 GB."""
+"""Of splats and tiles. Indices are 32-bit, and a backward pass keeps 52 bytes a pair: so many take 14 GB."""
 _NO_IMAGE = np.empty((0, 0), np.float32)
 _NO_COLOR = np.empty((0, 0, 3), np.float32)
 _BLACK = np.zeros(3, np.float32)
@@ -69,13 +71,13 @@ class _Settings:
 def _apply(gaussians: Gaussians, background: Tensor | None, settings: _Settings) -> RenderOutput:
     fields = (getattr(gaussians, field.name) for field in dataclasses.fields(gaussians))
     images = _Rasterize.apply(*fields, background, settings)
-    color, alpha, depth, culled, median, first_hit, largest_id, *found = images  # type: ignore[misc]  # untyped
-    contributors = Contributors(*found) if found[0] is not None else None
+    color, alpha, depth, culled, median, first_hit, largest_id, *pairs = images  # type: ignore[misc]  # untyped
+    contributors = Contributors(*pairs) if pairs[0] is not None else None
     return RenderOutput(color, alpha, depth, culled, median, first_hit, largest_id, contributors)
 
 
 class _Rasterize(torch.autograd.Function):
-    """Gaussians to (color, alpha, depth) and, without gradients, what was asked for besides."""
+    """Gaussians to (color, alpha, depth) and, without gradients, the requested outputs."""
 
     @staticmethod
     def forward(ctx: Any, *inputs: Any) -> tuple[Tensor | None, ...]:
@@ -83,10 +85,10 @@ class _Rasterize(torch.autograd.Function):
         ctx.set_materialize_grads(False)
         arrays, background = [_as_array(tensor) for tensor in tensors[:5]], _as_array(tensors[5])
         n, width, height = len(arrays[0]), settings.camera.width, settings.camera.height
-        view, center = _pack_camera(settings)
+        packed_camera, center = _pack_camera(settings)
         records = _new_records(n)
         bounds = records.view(np.int32)[:, -4:]
-        run_parts(_project_and_shade_part, *arrays, view, center, width, height, records, bounds)
+        run_parts(_project_and_shade_part, *arrays, packed_camera, center, width, height, records, bounds)
         tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
         order = sort_by_depth(records, bounds)
         bins = _bin_into_tiles(order, records, bounds, tiles_x, tiles_y)
@@ -97,7 +99,7 @@ class _Rasterize(torch.autograd.Function):
         extras = _auxiliary_pass(records, bins[0], bins[1], tiles_x, settings)
         ctx.mark_non_differentiable(culled, *(extra for extra in extras if extra is not None))
         ctx.save_for_backward(*tensors, *outputs)
-        ctx.splats = records, bounds, view, center
+        ctx.splats = records, bounds, packed_camera, center
         ctx.bins = *bins, tiles_x
         return *outputs, culled, *extras
 
@@ -106,8 +108,8 @@ class _Rasterize(torch.autograd.Function):
     def backward(ctx: Any, *v_outputs: Tensor | None) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         *tensors, color, alpha, depth = ctx.saved_tensors
         arrays = [_as_array(tensor) for tensor in tensors[:5]]
-        records, bounds, view, center = ctx.splats
-        tile_offsets, pairs, splat_offsets, places, tiles_x = ctx.bins
+        records, bounds, packed_camera, center = ctx.splats
+        tile_offsets, pairs, splat_offsets, pair_ids, tiles_x = ctx.bins
         height, width = alpha.shape
         images = color.numpy(), alpha.numpy(), depth.numpy()
         v_images = map(_as_array, v_outputs[:3], (_NO_COLOR, _NO_IMAGE, _NO_IMAGE))
@@ -118,8 +120,8 @@ class _Rasterize(torch.autograd.Function):
         # Zeros from NumPy: torch would fill them with OpenMP threads, which then spin on the cores we need.
         gradients = [np.zeros(array.shape, np.float32) for array in arrays]
         sums = np.empty((len(bounds), SUMS_SIZE), np.float32)
-        run_parts(_backward_part, *arrays, view, center, width, height, bounds, splat_offsets, places,
-                  pair_sums, sums, *gradients)  # fmt: skip
+        run_parts(_backward_part, *arrays, packed_camera, center, width, height, bounds, splat_offsets,
+                  pair_ids, pair_sums, sums, *gradients)  # fmt: skip
         v_background = None
         if ctx.needs_input_grad[5] and v_outputs[0] is not None:
             v_background = torch.einsum("hw,hwc->c", 1 - alpha, v_outputs[0])
@@ -145,8 +147,8 @@ def _bin_into_tiles(
     Returns:
         tile_offsets: [tiles + 1] where each tile's list starts.
         pairs: [p, 2] splat, and set of the tile's blocks that it touches.
-        splat_offsets: [n + 1] where each splat's places start.
-        places: [p] of each splat's pairs.
+        splat_offsets: [n + 1] where each splat's pairs start.
+        pair_ids: [p] indices of each splat's pairs.
     """
     cursors = np.empty((part_count(), tiles_x * tiles_y), np.int32)
     tiles = np.zeros(len(bounds), np.int32)
@@ -158,18 +160,18 @@ def _bin_into_tiles(
             f"than the {_MAX_PAIRS} that can be listed; are scales in metres, and is the camera outside?"
         )
     tile_offsets, splat_offsets = prefix_sum(cursors, tiles)
-    pairs, places = np.empty((tile_offsets[-1], 2), np.int32), np.empty(tile_offsets[-1], np.int32)
+    pairs, pair_ids = np.empty((tile_offsets[-1], 2), np.int32), np.empty(tile_offsets[-1], np.int32)
     run_parts(emit_intersections_part, order, records, bounds, tiles_x, FIRST_ROWS, cursors, splat_offsets,
-              pairs, places)  # fmt: skip
-    return tile_offsets, pairs, splat_offsets, places
+              pairs, pair_ids)  # fmt: skip
+    return tile_offsets, pairs, splat_offsets, pair_ids
 
 
 def _auxiliary_pass(
     records: np.ndarray, tile_offsets: np.ndarray, pairs: np.ndarray, tiles_x: int, settings: _Settings
 ) -> tuple[Tensor | None, ...]:
-    """Return median and front depths, the largest weight, and the counts, ids and weights of contributors.
+    """Return median and first-hit depths, splats of the largest weights, and contributors.
 
-    What is not wanted is None.
+    Contributors are counts, ids and weights. What is not requested is None.
     """
     if not settings.outputs:
         return (None,) * 6
@@ -197,33 +199,35 @@ def _auxiliary_pass(
 
     run_pass()
     images = {"median_depth": medians, "first_hit_depth": first_hits, "largest_weight_id": largest_id}
-    wanted = tuple(image if name in settings.outputs else None for name, image in images.items())
+    requested = tuple(image if name in settings.outputs else None for name, image in images.items())
     if "contributors" not in settings.outputs:
-        return *wanted, None, None, None
+        return *requested, None, None, None
     ends = counts.flatten().cumsum(0)
     starts = (ends - counts.flatten()).numpy()
     ids, weights = torch.empty(int(ends[-1]), dtype=torch.int64), torch.empty(int(ends[-1]))
     run_pass()
-    return *wanted, counts, ids, weights
+    return *requested, counts, ids, weights
 
 
 def _project_and_shade_part(
     part, parts, means, rotations, scales, opacities, harmonics,
-    view, center, width, height, records, bounds,
+    packed_camera, center, width, height, records, bounds,
 ):  # fmt: skip
-    """Turn one part of the Gaussians into splats."""
-    project_part(part, parts, means, rotations, scales, opacities, view, width, height, records, bounds)
+    """Project and shade one part of the Gaussians: write their records and bounds."""
+    project_part(
+        part, parts, means, rotations, scales, opacities, packed_camera, width, height, records, bounds
+    )
     shade_part(part, parts, means, harmonics, center, records, bounds)
 
 
 def _backward_part(
     part, parts, means, rotations, scales, opacities, harmonics,
-    view, center, width, height, bounds, splat_offsets, places, pair_sums, sums,
+    packed_camera, center, width, height, bounds, splat_offsets, pair_ids, pair_sums, sums,
     v_means, v_rotations, v_scales, v_opacities, v_harmonics,
 ):  # fmt: skip
     """Bring the gradients of one part's splats back to their Gaussians."""
-    reduce_sums_part(part, parts, splat_offsets, places, pair_sums, sums)
-    project_backward_part(part, parts, means, rotations, scales, opacities, view, width, height,
+    reduce_sums_part(part, parts, splat_offsets, pair_ids, pair_sums, sums)
+    project_backward_part(part, parts, means, rotations, scales, opacities, packed_camera, width, height,
                           bounds, sums, v_means, v_rotations, v_scales, v_opacities)  # fmt: skip
     shade_backward_part(part, parts, means, harmonics, center, bounds, sums, v_harmonics, v_means)
 
@@ -237,11 +241,11 @@ def _pack_camera(settings: _Settings) -> tuple[np.ndarray, np.ndarray]:
     """Return the kernels' camera (18 numbers, see kernels_projection) and its centre in the world."""
     transform, K = (t.detach().cpu().numpy() for t in (settings.camera.T_camera_world, settings.camera.K))
     rotation, translation = transform[:3, :3], transform[:3, 3]
-    view = np.empty(18, np.float32)
-    view[:9], view[9:12] = rotation.ravel(), translation
-    view[12:16] = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
-    view[16:] = settings.dilation, settings.antialiased
-    return view, (-rotation.T @ translation).astype(np.float32)
+    packed = np.empty(18, np.float32)
+    packed[:9], packed[9:12] = rotation.ravel(), translation
+    packed[12:16] = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    packed[16:] = settings.dilation, settings.antialiased
+    return packed, (-rotation.T @ translation).astype(np.float32)
 
 
 @cache

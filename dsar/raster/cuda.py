@@ -38,20 +38,20 @@ def rasterize_cuda(
     if not len(gaussians):
         return rasterize_reference(gaussians, camera, background, dilation, antialiased, outputs)
     gsplat = _load_gsplat()
-    sound = _hide_invalid(gaussians)
+    valid = _hide_invalid(gaussians)
     image, alpha, meta = gsplat.rasterization(
-        sound.means,
-        sound.rotations,
-        sound.scales,
-        sound.opacities,
-        sound.harmonics,
-        camera.T_camera_world.to(sound.means)[None],
-        camera.K.to(sound.means)[None],
+        valid.means,
+        valid.rotations,
+        valid.scales,
+        valid.opacities,
+        valid.harmonics,
+        camera.T_camera_world.to(valid.means)[None],
+        camera.K.to(valid.means)[None],
         camera.width,
         camera.height,
         near_plane=NEAR,
         eps2d=dilation,
-        sh_degree=round(sound.harmonics.shape[1] ** 0.5) - 1,
+        sh_degree=round(valid.harmonics.shape[1] ** 0.5) - 1,
         packed=False,
         render_mode="RGB+ED",
         rasterize_mode="antialiased" if antialiased else "classic",
@@ -59,19 +59,19 @@ def rasterize_cuda(
     color, depth, alpha = image[0, ..., :3], image[0, ..., 3], alpha[0, ..., 0]
     if background is not None:
         color = color + (1 - alpha[..., None]) * background
-    drawn = (meta["radii"][0] > 0).all(-1).sum()
+    visible = (meta["radii"][0] > 0).all(-1).sum()
     extras: dict[str, Any] = {}
     if outputs:
         contributors, before = _find_contributors(gsplat, meta, camera)
         depths = meta["depths"][0].detach()
-        found = {
+        compute = {
             "median_depth": lambda: _median_depth(contributors, before, depths),
             "first_hit_depth": lambda: find_first_hit_depth(contributors, depths),
             "largest_weight_id": lambda: find_largest_weight_id(contributors),
             "contributors": lambda: contributors,
         }
-        extras = {name: found[name]() for name in outputs}
-    return RenderOutput(color, alpha, depth, len(gaussians) - drawn, **extras)
+        extras = {name: compute[name]() for name in outputs}
+    return RenderOutput(color, alpha, depth, len(gaussians) - visible, **extras)
 
 
 @cache
@@ -102,12 +102,12 @@ def _hide_invalid(gaussians: Gaussians) -> Gaussians:
     their number.
     """
     norms = gaussians.rotations.norm(dim=-1)
-    sound = (gaussians.scales > 0).all(-1) & (norms > 0) & norms.isfinite()
+    is_valid = (gaussians.scales > 0).all(-1) & (norms > 0) & norms.isfinite()
     for values in vars(gaussians).values():
-        sound &= values.detach().isfinite().reshape(len(values), -1).all(-1)
+        is_valid &= values.detach().isfinite().reshape(len(values), -1).all(-1)
 
     def replace(values: Tensor, substitute: float) -> Tensor:
-        return torch.where(sound.view(-1, *[1] * (values.ndim - 1)), values, substitute)
+        return torch.where(is_valid.view(-1, *[1] * (values.ndim - 1)), values, substitute)
 
     return Gaussians(
         replace(gaussians.means, 0.0),

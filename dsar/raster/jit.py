@@ -40,24 +40,24 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     try:
         dispatcher = njit(cache=True, nogil=True, **_OPTIONS)(plain)
     except RuntimeError as error:  # neither the package's folder nor the user's takes files
-        _say_not_kept(str(error))
+        _warn_not_cached(str(error))
         return njit(nogil=True, **_OPTIONS)(plain)
-    kept: Any = dispatcher._cache  # pyright: ignore[reportAttributeAccessIssue]  # no public way
-    kept._cache_file._source_stamp = kept._cache_file._source_stamp, _SHARED
-    save = kept.save_overload
+    disk_cache: Any = dispatcher._cache  # pyright: ignore[reportAttributeAccessIssue]  # no public way
+    disk_cache._cache_file._source_stamp = disk_cache._cache_file._source_stamp, _SHARED
+    save = disk_cache.save_overload
 
     def save_if_there_is_room(*compiled: Any) -> None:
         try:
             save(*compiled)
         except OSError as error:
-            _say_not_kept(str(error))
+            _warn_not_cached(str(error))
 
-    kept.save_overload = save_if_there_is_room
+    disk_cache.save_overload = save_if_there_is_room
     return dispatcher
 
 
 @cache
-def _say_not_kept(reason: str) -> None:
+def _warn_not_cached(reason: str) -> None:
     """Say once that compiled kernels are not kept."""
     _logger.warning(
         "The rasteriser's compiled kernels cannot be kept, and are compiled every time (about 30 s): %s; "

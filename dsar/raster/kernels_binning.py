@@ -2,7 +2,7 @@
 
 Splats are sorted by depth once for the whole image; dealing them out to the tiles in that order leaves every
 tile's list sorted. A (tile, splat) pair is two numbers, the splat and the set of the tile's blocks that it
-touches. The backward pass leaves sums with every pair; each splat knows the places of its pairs: tiles write
+touches. The backward pass leaves sums with every pair; each splat knows the indices of its pairs: tiles write
 without meeting, and sums run in one fixed order, so gradients are deterministic.
 
 Several parts deal at once: each takes a stretch of the sorted splats, and counting first tells every part
@@ -105,7 +105,7 @@ def prefix_sum(counts, tiles):
 
     Returns:
         tile_offsets: [tiles + 1] where each tile's pairs start.
-        splat_offsets: [n + 1] where each splat's places start.
+        splat_offsets: [n + 1] where each splat's pairs start.
     """
     tile_offsets, splat_offsets = np.empty(counts.shape[1] + 1, np.int32), np.empty(len(tiles) + 1, np.int32)
     total = np.int32(0)
@@ -146,15 +146,15 @@ def _outline(records, i, top, first_rows):
 
 @kernel
 def emit_intersections_part(
-    part, parts, order, records, bounds, tiles_x, first_rows, cursors, splat_offsets, pairs, places
+    part, parts, order, records, bounds, tiles_x, first_rows, cursors, splat_offsets, pairs, pair_ids
 ):
-    """Write one part's pairs into the tiles' lists, and their places with the splats."""
+    """Write one part's pairs into the tiles' lists, and their indices with the splats."""
     n, flat, cursors = len(order), records.reshape(-1), cursors[part]
     for k in range(n * part // parts, n * (part + 1) // parts):
         _prefetch_record(flat, order, k)
         i = np.uint64(order[k])
         x0, x1, y0, y1 = _tile_span(bounds, i)
-        own = splat_offsets[i]
+        slot = splat_offsets[i]
         for row in range(y0, y1):
             begin, end, touched = _outline(records, i, np.float32(row * TILE), first_rows)
             for column in range(x0, x1):
@@ -165,22 +165,22 @@ def emit_intersections_part(
                     meets = touched & (begin <= first + np.float32(BLOCK_WIDTH - 1)) & (end >= first)
                     blocks |= (movemask(meets) & _ALL_STRIPS) << np.uint32(block * STRIPS)
                 tile = np.uint64(row * tiles_x + column)
-                place = np.uint64(cursors[tile])
+                index = np.uint64(cursors[tile])
                 cursors[tile] += 1
-                pairs[place, 0], pairs[place, 1] = i, blocks
-                places[own] = place
-                own += 1
+                pairs[index, 0], pairs[index, 1] = i, blocks
+                pair_ids[slot] = index
+                slot += 1
 
 
 @kernel
-def reduce_sums_part(part, parts, splat_offsets, places, pair_sums, sums):
+def reduce_sums_part(part, parts, splat_offsets, pair_ids, pair_sums, sums):
     """Add up the sums of each splat's pairs."""
     n, flat = len(splat_offsets) - 1, pair_sums.reshape(-1)
     for i in range(n * part // parts, n * (part + 1) // parts):
         for k in range(sums.shape[1]):
             sums[i, k] = _ZERO
-        for own in range(splat_offsets[i], splat_offsets[i + 1]):
-            if own + PREFETCH_DISTANCE < len(places):
-                prefetch(flat, np.uint64(places[own + PREFETCH_DISTANCE]) * np.uint64(sums.shape[1]))
+        for slot in range(splat_offsets[i], splat_offsets[i + 1]):
+            if slot + PREFETCH_DISTANCE < len(pair_ids):
+                prefetch(flat, np.uint64(pair_ids[slot + PREFETCH_DISTANCE]) * np.uint64(sums.shape[1]))
             for k in range(sums.shape[1]):
-                sums[i, k] += pair_sums[places[own], k]
+                sums[i, k] += pair_sums[pair_ids[slot], k]

@@ -1,9 +1,6 @@
 """Numba kernels: splats blended front to back into the pixels of a tile, and the way back.
 
-A tile's pixels live in one flat array, block by block, each block as planes of LANES values: a splat visits
-the blocks that it touches, and every step of the blending is one instruction for a whole block. A pixel that
-is finished stays among its block's lanes: its transmittance is kept negative, which makes every later splat
-fail the test `T (1 - alpha) > minimum`. Every few splats, blocks without a live pixel leave the tile's set.
+The state of a tile, block by block, is `tile_state`'s.
 
 The backward pass walks front to back again and needs one running scalar per pixel: with q the splat's colour,
 and how far it is behind the pixel's depth, times the pixel's gradient, and `rest` what all splats behind it
@@ -22,28 +19,23 @@ import math
 
 import numpy as np
 
-from dsar.raster.conventions import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+from dsar.raster.conventions import ALPHA_MAX
 from dsar.raster.jit import inlined, kernel
-from dsar.raster.simd import (
-    LANES,
-    broadcast,
-    count_trailing_zeros,
-    exp2,
-    load,
-    minimum,
-    movemask,
-    negative_abs,
-    prefetch,
-    reduce_add,
-    select,
-    store,
+from dsar.raster.simd import LANES, broadcast, count_trailing_zeros, load, reduce_add, select, store
+from dsar.raster.tile_state import (
+    CHECK_INTERVAL,
+    TRANSMITTANCE,
+    blend,
+    find_active,
+    init_tile,
+    new_state,
+    pixel_start,
+    prefetch_record,
+    splat_in_tile,
 )
-from dsar.raster.tiles import BLOCK_HEIGHT, BLOCK_WIDTH, BLOCKS, PREFETCH_DISTANCE, RECORD_SIZE, STRIPS, TILE
+from dsar.raster.tiles import BLOCKS, TILE
 
-# How many splats pass between two looks at which blocks are finished.
-_CHECK_INTERVAL = 32
-# Planes of a block. Both passes: transmittance, pixel centre x and y (from the tile's corner).
-_T, _X, _Y = (np.uint64(plane * LANES) for plane in (0, 1, 2))
+# Planes of a block, behind those of `tile_state`.
 # Forward: what has been blended so far.
 _RED, _GREEN, _BLUE, _DEPTH = (np.uint64(plane * LANES) for plane in (3, 4, 5, 6))
 _FORWARD = np.uint64(7 * LANES)
@@ -52,98 +44,14 @@ _V_RED, _V_GREEN, _V_BLUE, _V_DEPTH, _LEVEL, _REST = (
     np.uint64(plane * LANES) for plane in (3, 4, 5, 6, 7, 8)
 )
 _BACKWARD = np.uint64(9 * LANES)
-# Auxiliary pass: depth at half transmittance, how many splats were blended, depth of the first, and the
-# largest weight with its splat (a number that is exact up to 16 million).
-_MEDIAN, _COUNT, _FIRST_HIT, _LARGEST_WEIGHT, _LARGEST_ID = (
-    np.uint64(plane * LANES) for plane in (3, 4, 5, 6, 7)
-)
-_AUXILIARY = np.uint64(8 * LANES)
 
-_LOG_ALPHA_MIN, _LOG_ALPHA_MAX = np.float32(math.log2(ALPHA_MIN)), np.float32(math.log2(ALPHA_MAX))
-_ALPHA_MAX, _T_MIN = np.float32(ALPHA_MAX), np.float32(TRANSMITTANCE_MIN)
-_ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
+_LOG_ALPHA_MAX = np.float32(math.log2(ALPHA_MAX))
+_ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 
 
 @inlined
-def _new_state(stride):
-    """Return a tile's state, blocks of `stride` values, with its pixel centres filled in."""
-    state = np.zeros(BLOCKS * stride, np.float32)
-    for block in range(BLOCKS):
-        for lane in range(LANES):
-            pixel = block * stride + np.uint64(lane)
-            x, y = block // STRIPS * BLOCK_WIDTH, block % STRIPS * BLOCK_HEIGHT
-            state[pixel + _X] = np.float32(x + lane % BLOCK_WIDTH) + _HALF
-            state[pixel + _Y] = np.float32(y + lane // BLOCK_WIDTH) + _HALF
-    return state
-
-
-@inlined
-def _pixel(x, y, stride):
-    """Return where a pixel of the tile lies in its state."""
-    block = x // BLOCK_WIDTH * STRIPS + y // BLOCK_HEIGHT
-    return np.uint64(block) * stride + np.uint64(y % BLOCK_HEIGHT * BLOCK_WIDTH + x % BLOCK_WIDTH)
-
-
-@inlined
-def _init_tile(state, stride, width, height):
-    """Start pixels inside the image, which ends at `width`, `height`, as transparent, others as finished."""
-    width, height = np.float32(width), np.float32(height)
-    for block in range(np.uint64(BLOCKS)):
-        start = block * stride
-        inside = (load(state, start + _X) < width) & (load(state, start + _Y) < height)
-        store(state, start, select(inside, broadcast(_ONE), broadcast(-_ONE)))
-
-
-@inlined
-def _find_active(state, stride):
-    """Return the set of blocks with a pixel that is not finished."""
-    active = np.uint32(0)
-    for block in range(np.uint64(BLOCKS)):
-        if movemask(load(state, block * stride) > _ZERO) != np.uint32(0):
-            active |= np.uint32(1) << np.uint32(block)
-    return active
-
-
-@inlined
-def _prefetch_record(records, pairs, place):
-    """Have the record of a splat that is due soon brought into the cache."""
-    due = place + np.uint64(PREFETCH_DISTANCE)
-    if due < np.uint64(len(pairs)):
-        prefetch(records, np.uint64(pairs[due, 0]) * np.uint64(RECORD_SIZE))
-
-
-@inlined
-def _splat_in_tile(records, i, left, top):
-    """Return what `_blend` needs of a splat, with the tile's corner as origin."""
-    x, y = records[i, 0] - np.float32(left), records[i, 1] - np.float32(top)
-    return (
-        broadcast(records[i, 2] * x - records[i, 3] * y),
-        broadcast(records[i, 2]),
-        broadcast(records[i, 3]),
-        broadcast(records[i, 4] * y),
-        broadcast(records[i, 4]),
-        broadcast(records[i, 5]),
-    )
-
-
-@inlined
-def _blend(state, start, e1_origin, stretch, shear, e2_origin, height, log_opacity):
-    """Pass one splat over one block; return e1, e2, log2 alpha, weight and the transmittance before it."""
-    e1 = e1_origin - stretch * load(state, start + _X) + shear * load(state, start + _Y)
-    e2 = e2_origin - height * load(state, start + _Y)
-    log_alpha = log_opacity - e1 * e1 - e2 * e2
-    alpha = minimum(exp2(log_alpha), broadcast(_ALPHA_MAX))
-    before = load(state, start + _T)
-    weight = select(log_alpha >= _LOG_ALPHA_MIN, alpha * before, broadcast(_ZERO))
-    after = before - weight
-    running = after > _T_MIN
-    store(state, start + _T, select(running, after, negative_abs(before)))
-    return e1, e2, log_alpha, select(running, weight, broadcast(_ZERO)), before
-
-
-@inlined
-def _add(state, place, values):
-    store(state, place, load(state, place) + values)
+def _add(state, index, values):
+    store(state, index, load(state, index) + values)
 
 
 @inlined
@@ -162,21 +70,21 @@ def _write_tile(state, left, top, background, color, alpha, depth):
     height, width = alpha.shape
     for y in range(min(TILE, height - top)):
         for x in range(min(TILE, width - left)):
-            pixel = _pixel(x, y, _FORWARD)
-            through = abs(state[pixel + _T])
-            color[top + y, left + x, 0] = state[pixel + _RED] + through * background[0]
-            color[top + y, left + x, 1] = state[pixel + _GREEN] + through * background[1]
-            color[top + y, left + x, 2] = state[pixel + _BLUE] + through * background[2]
-            alpha[top + y, left + x] = _ONE - through
-            hit = through < _ONE
-            depth[top + y, left + x] = state[pixel + _DEPTH] / (_ONE - through) if hit else _ZERO
+            pixel = pixel_start(x, y, _FORWARD)
+            transmittance = abs(state[pixel + TRANSMITTANCE])
+            color[top + y, left + x, 0] = state[pixel + _RED] + transmittance * background[0]
+            color[top + y, left + x, 1] = state[pixel + _GREEN] + transmittance * background[1]
+            color[top + y, left + x, 2] = state[pixel + _BLUE] + transmittance * background[2]
+            alpha[top + y, left + x] = _ONE - transmittance
+            hit = transmittance < _ONE
+            depth[top + y, left + x] = state[pixel + _DEPTH] / (_ONE - transmittance) if hit else _ZERO
 
 
 @kernel
 def composite_part(part, parts, records, tile_offsets, pairs, tiles_x, background, color, alpha, depth):
     """Blend the splats of every parts-th tile into the images."""
     height, width = alpha.shape
-    state, flat = _new_state(_FORWARD), records.reshape(-1)
+    state, flat = new_state(_FORWARD), records.reshape(-1)
     # Neighbouring tiles cost about the same: dealing them out in turn keeps the parts even.
     for tile in range(part, len(tile_offsets) - 1, parts):
         left, top = tile % tiles_x * TILE, tile // tiles_x * TILE
@@ -184,18 +92,18 @@ def composite_part(part, parts, records, tile_offsets, pairs, tiles_x, backgroun
         if start == end:
             _write_empty_tile(left, top, background, color, alpha, depth)
             continue
-        _init_tile(state, _FORWARD, width - left, height - top)
+        init_tile(state, _FORWARD, width - left, height - top)
         for block in range(np.uint64(BLOCKS)):
             for plane in (_RED, _GREEN, _BLUE, _DEPTH):
                 store(state, block * _FORWARD + plane, broadcast(_ZERO))
-        active = _find_active(state, _FORWARD)
-        for place in range(start, end):
-            if (place - start) % np.uint64(_CHECK_INTERVAL) == np.uint64(_CHECK_INTERVAL - 1):
-                active = _find_active(state, _FORWARD)
+        active = find_active(state, _FORWARD)
+        for index in range(start, end):
+            if (index - start) % np.uint64(CHECK_INTERVAL) == np.uint64(CHECK_INTERVAL - 1):
+                active = find_active(state, _FORWARD)
                 if active == np.uint32(0):
                     break
-            _prefetch_record(flat, pairs, place)
-            blocks, i = np.uint32(pairs[place, 1]) & active, np.uint64(pairs[place, 0])
+            prefetch_record(flat, pairs, index)
+            blocks, i = np.uint32(pairs[index, 1]) & active, np.uint64(pairs[index, 0])
             _blend_splat(state, blocks, records, i, left, top)
         _write_tile(state, left, top, background, color, alpha, depth)
 
@@ -203,12 +111,12 @@ def composite_part(part, parts, records, tile_offsets, pairs, tiles_x, backgroun
 @inlined
 def _blend_splat(state, blocks, records, i, left, top):
     """Blend one splat over a set of blocks."""
-    splat = _splat_in_tile(records, i, left, top)
+    splat = splat_in_tile(records, i, left, top)
     red, green, blue, z = records[i, 6], records[i, 7], records[i, 8], records[i, 9]
     while blocks != np.uint32(0):
         start = count_trailing_zeros(blocks) * _FORWARD
         blocks &= blocks - np.uint32(1)
-        _, _, _, weight, _ = _blend(state, start, *splat)
+        _, _, _, weight, _ = blend(state, start, *splat)
         _add(state, start + _RED, weight * red)
         _add(state, start + _GREEN, weight * green)
         _add(state, start + _BLUE, weight * blue)
@@ -218,7 +126,7 @@ def _blend_splat(state, blocks, records, i, left, top):
 @inlined
 def _blend_splat_backward(state, blocks, records, i, left, top, out):
     """Blend one splat again, and write its gradient sums over a set of blocks."""
-    splat = _splat_in_tile(records, i, left, top)
+    splat = splat_in_tile(records, i, left, top)
     red, green, blue, z = records[i, 6], records[i, 7], records[i, 8], records[i, 9]
     zero = broadcast(_ZERO)
     s, s1, s2, s11, s12, s22 = zero, zero, zero, zero, zero, zero
@@ -226,7 +134,7 @@ def _blend_splat_backward(state, blocks, records, i, left, top, out):
     while blocks != np.uint32(0):
         start = count_trailing_zeros(blocks) * _BACKWARD
         blocks &= blocks - np.uint32(1)
-        e1, e2, log_alpha, weight, before = _blend(state, start, *splat)
+        e1, e2, log_alpha, weight, before = blend(state, start, *splat)
         q = red * load(state, start + _V_RED) + green * load(state, start + _V_GREEN)
         q += blue * load(state, start + _V_BLUE)
         q += z * load(state, start + _V_DEPTH) - load(state, start + _LEVEL)
@@ -267,7 +175,7 @@ def _load_gradients(state, left, top, color, alpha, depth, v_color, v_alpha, v_d
                 store(state, block * _BACKWARD + plane, broadcast(_ZERO))
     for y in range(top, min(top + TILE, height)):
         for x in range(left, min(left + TILE, width)):
-            pixel = _pixel(x - left, y - top, _BACKWARD)
+            pixel = pixel_start(x - left, y - top, _BACKWARD)
             red, green, blue, v_z, rest = _ZERO, _ZERO, _ZERO, _ZERO, _ZERO
             if len(v_alpha) > 0:
                 rest -= (_ONE - alpha[y, x]) * v_alpha[y, x]
@@ -290,96 +198,21 @@ def composite_backward_part(
 ):  # fmt: skip
     """Write the gradient sums of every pair in every parts-th tile. Empty v_* mean zero."""
     height, width = alpha.shape
-    state, flat = _new_state(_BACKWARD), records.reshape(-1)
+    state, flat = new_state(_BACKWARD), records.reshape(-1)
     for tile in range(part, len(tile_offsets) - 1, parts):
         left, top = tile % tiles_x * TILE, tile // tiles_x * TILE
         start, end = np.uint64(tile_offsets[tile]), np.uint64(tile_offsets[tile + 1])
         if start == end:
             continue
-        _init_tile(state, _BACKWARD, width - left, height - top)
+        init_tile(state, _BACKWARD, width - left, height - top)
         _load_gradients(state, left, top, color, alpha, depth, v_color, v_alpha, v_depth)
-        active = _find_active(state, _BACKWARD)
-        for place in range(start, end):
-            if (place - start) % np.uint64(_CHECK_INTERVAL) == np.uint64(_CHECK_INTERVAL - 1):
-                active = _find_active(state, _BACKWARD)
-            _prefetch_record(flat, pairs, place)
-            blocks, i = np.uint32(pairs[place, 1]) & active, np.uint64(pairs[place, 0])
+        active = find_active(state, _BACKWARD)
+        for index in range(start, end):
+            if (index - start) % np.uint64(CHECK_INTERVAL) == np.uint64(CHECK_INTERVAL - 1):
+                active = find_active(state, _BACKWARD)
+            prefetch_record(flat, pairs, index)
+            blocks, i = np.uint32(pairs[index, 1]) & active, np.uint64(pairs[index, 0])
             if blocks == np.uint32(0):
-                pair_sums[place] = _ZERO
+                pair_sums[index] = _ZERO
             else:
-                _blend_splat_backward(state, blocks, records, i, left, top, pair_sums[place])
-
-
-@inlined
-def _accumulate_auxiliary(state, start, i, z, weight, before):
-    """Remember of a splat what is asked about a block's pixels."""
-    blended = weight > _ZERO
-    z = broadcast(z)
-    median, first_hit = load(state, start + _MEDIAN), load(state, start + _FIRST_HIT)
-    count = load(state, start + _COUNT)
-    store(state, start + _MEDIAN, select(blended & (before > _HALF), z, median))
-    store(state, start + _FIRST_HIT, select(blended & (count < _HALF), z, first_hit))
-    store(state, start + _COUNT, count + select(blended, broadcast(_ONE), broadcast(_ZERO)))
-    largest, largest_id = load(state, start + _LARGEST_WEIGHT), load(state, start + _LARGEST_ID)
-    heavier = weight > largest
-    store(state, start + _LARGEST_WEIGHT, select(heavier, weight, largest))
-    store(state, start + _LARGEST_ID, select(heavier, broadcast(np.float32(i)), largest_id))
-
-
-@kernel
-def composite_auxiliary_part(
-    part, parts, records, tile_offsets, pairs, tiles_x, starts,
-    medians, first_hits, largest_id, counts, ids, weights,
-):  # fmt: skip
-    """Blend every parts-th tile once more, for depths, the largest weight and how many each pixel has.
-
-    If `ids` is not empty, write each pixel's splats and weights from its start on. One kernel does both,
-    because another might round otherwise, and find another number of splats.
-    """
-    height, width = medians.shape
-    state, flat = _new_state(_AUXILIARY), records.reshape(-1)
-    lanes, cursors = np.empty(LANES, np.float32), np.zeros(BLOCKS * LANES, np.int64)
-    collecting = len(ids) > 0
-    for tile in range(part, len(tile_offsets) - 1, parts):
-        left, top = tile % tiles_x * TILE, tile // tiles_x * TILE
-        _init_tile(state, _AUXILIARY, width - left, height - top)
-        for block in range(np.uint64(BLOCKS)):
-            for plane in (_MEDIAN, _COUNT, _FIRST_HIT, _LARGEST_WEIGHT):
-                store(state, block * _AUXILIARY + plane, broadcast(_ZERO))
-            store(state, block * _AUXILIARY + _LARGEST_ID, broadcast(-_ONE))
-        if collecting:
-            for y in range(min(TILE, height - top)):
-                for x in range(min(TILE, width - left)):
-                    cursors[_pixel(x, y, np.uint64(LANES))] = starts[(top + y) * width + left + x]
-        active = _find_active(state, _AUXILIARY)
-        first, end = np.uint64(tile_offsets[tile]), np.uint64(tile_offsets[tile + 1])
-        for place in range(first, end):
-            if (place - first) % np.uint64(_CHECK_INTERVAL) == np.uint64(_CHECK_INTERVAL - 1):
-                active = _find_active(state, _AUXILIARY)
-                if active == np.uint32(0):
-                    break
-            _prefetch_record(flat, pairs, place)
-            blocks, i = np.uint32(pairs[place, 1]) & active, np.uint64(pairs[place, 0])
-            splat = _splat_in_tile(records, i, left, top)
-            while blocks != np.uint32(0):
-                block = count_trailing_zeros(blocks)
-                start = block * _AUXILIARY
-                blocks &= blocks - np.uint32(1)
-                _, _, _, weight, before = _blend(state, start, *splat)
-                blended = weight > _ZERO
-                _accumulate_auxiliary(state, start, i, records[i, 9], weight, before)
-                store(lanes, np.uint64(0), weight)
-                hits = movemask(blended) if collecting else np.uint32(0)
-                while hits != np.uint32(0):
-                    lane = count_trailing_zeros(hits)
-                    hits &= hits - np.uint32(1)
-                    pixel = block * np.uint64(LANES) + lane
-                    ids[cursors[pixel]], weights[cursors[pixel]] = i, lanes[lane]
-                    cursors[pixel] += 1
-        for y in range(min(TILE, height - top)):
-            for x in range(min(TILE, width - left)):
-                pixel = _pixel(x, y, _AUXILIARY)
-                medians[top + y, left + x] = state[pixel + _MEDIAN]
-                first_hits[top + y, left + x] = state[pixel + _FIRST_HIT]
-                largest_id[top + y, left + x] = np.int64(state[pixel + _LARGEST_ID])
-                counts[top + y, left + x] = np.int64(state[pixel + _COUNT])
+                _blend_splat_backward(state, blocks, records, i, left, top, pair_sums[index])

@@ -64,7 +64,7 @@ def rasterize_reference(
     outputs: Collection[str],
 ) -> RenderOutput:
     """Rasterise in plain torch: `dsar.raster.rasterize` without its checks, for any dtype and device."""
-    splats = _splat(gaussians, camera, dilation, antialiased)
+    splats = _project_splats(gaussians, camera, dilation, antialiased)
     rows = [
         [_blend_tile(splats, x, y, camera) for x in range(0, camera.width, _TILE)]
         for y in range(0, camera.height, _TILE)
@@ -80,18 +80,18 @@ def rasterize_reference(
     if "median_depth" in outputs:
         extras["median_depth"] = torch.cat([torch.cat([t.median_depth for t in row], 1) for row in rows], 0)
     if {"first_hit_depth", "largest_weight_id", "contributors"} & set(outputs):
-        contributors = _join([tile for row in rows for tile in row], camera)
+        contributors = _join_tiles([tile for row in rows for tile in row], camera)
         depths = splats.features.new_zeros(len(gaussians)).index_copy(0, splats.ids, splats.features[:, 3])
-        found = {
+        compute = {
             "first_hit_depth": lambda: find_first_hit_depth(contributors, depths.detach()),
             "largest_weight_id": lambda: find_largest_weight_id(contributors),
             "contributors": lambda: contributors,
         }
-        extras |= {name: found[name]() for name in outputs if name in found}
+        extras |= {name: compute[name]() for name in outputs if name in compute}
     return RenderOutput(color, alpha[..., 0], depth[..., 0], culled, **extras)
 
 
-def _splat(gaussians: Gaussians, camera: Camera, dilation: float, antialiased: bool) -> _Splats:
+def _project_splats(gaussians: Gaussians, camera: Camera, dilation: float, antialiased: bool) -> _Splats:
     """Return those Gaussians that reach a pixel, front to back, ties in their own order."""
     drawable = _find_drawable(gaussians, camera, dilation, antialiased)
     # Selected before anything is computed: what is left out cannot send NaN back through a zero gradient.
@@ -127,8 +127,8 @@ def _find_drawable(
 @torch.no_grad()
 def _radii(covariances: Float[Tensor, "n 2 2"], opacities: Float[Tensor, " n"]) -> Float[Tensor, "n 2"]:
     """Return the half-width and half-height, pixels, outside which alpha < ALPHA_MIN."""
-    reach = 2 * (opacities / ALPHA_MIN).log()
-    return (reach[:, None] * covariances.diagonal(dim1=-2, dim2=-1)).sqrt()
+    cutoff = 2 * (opacities / ALPHA_MIN).log()
+    return (cutoff[:, None] * covariances.diagonal(dim1=-2, dim2=-1)).sqrt()
 
 
 def _shade(gaussians: Gaussians, camera: Camera) -> Float[Tensor, "n 3"]:
@@ -191,21 +191,21 @@ def _blend_tile(splats: _Splats, left: int, top: int, camera: Camera) -> _Tile:
     size = (bottom - top, right - left)
     return _Tile(
         image.unflatten(0, size),
-        _last_before_half(blended & (before > 0.5), features[:, 3].detach()).unflatten(0, size),
+        _last_depth(blended & (before > 0.5), features[:, 3].detach()).unflatten(0, size),
         (y * camera.width + x).to(pixel.device).flatten()[pixel],
         splats.ids[touches][splat],
         weights.detach()[splat, pixel],
     )
 
 
-def _last_before_half(candidates: Bool[Tensor, "n p"], depths: Float[Tensor, " n"]) -> Float[Tensor, " p"]:
+def _last_depth(candidates: Bool[Tensor, "n p"], depths: Float[Tensor, " n"]) -> Float[Tensor, " p"]:
     """Return the depth of each pixel's last candidate, 0 where there is none."""
     order = torch.arange(1, len(depths) + 1, device=depths.device)[:, None]
     last = torch.cat([order.new_zeros(1, candidates.shape[1]), candidates * order]).amax(0)
     return torch.cat([depths.new_zeros(1), depths])[last]
 
 
-def _join(tiles: list[_Tile], camera: Camera) -> Contributors:
+def _join_tiles(tiles: list[_Tile], camera: Camera) -> Contributors:
     """Return the tiles' pairs, pixel after pixel of the whole image."""
     pixels, ids, weights = (
         torch.cat([getattr(t, name) for t in tiles]) for name in ("pixels", "ids", "weights")

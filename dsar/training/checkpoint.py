@@ -5,7 +5,7 @@ scene.safetensors        the capture's cameras and motions, without its images (
 checkpoint/              replaced as a whole, never half written
     avatar.safetensors       parameters, skeleton, atlas
     adam.safetensors, muon.safetensors   moments of the optimisers
-    rollouts-<rank>.safetensors, rollouts-<rank>.json   carried state of each worker's rollouts
+    rollouts-<rank>.safetensors   where each worker's rollouts stand, and what they remember
     registration-<rank>.safetensors   offsets of the still and the registered frames
     progress.json            step, progress, format version, the run's folder at that time
 metrics.jsonl            one line per report
@@ -19,7 +19,7 @@ import json
 import logging
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,6 @@ from typing import Any
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
-from safetensors.torch import save_file
 from torch import Tensor
 
 from dsar.avatar.avatar import Avatar
@@ -36,9 +35,10 @@ from dsar.body.model import PARENTS
 from dsar.config import EMBEDDED, TrainConfig, config_from_json
 from dsar.errors import CheckpointError, ConfigError
 from dsar.text import decode_text
+from dsar.training.migrations import OLDEST_VERSION, rename_tensors
 from dsar.types import Body
 
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 _BODY = ("vertices", "faces", "joints", "weights", "uv", "uv_faces")
 # What a damaged or foreign file can raise on its way to what it should have been.
 _DAMAGE = (SafetensorError, ValueError, KeyError, IndexError, TypeError, AttributeError, RuntimeError)
@@ -181,7 +181,7 @@ def _located(run: Run, recorded: str, what: str) -> str:
     candidates = [path.resolve()]
     if not path.is_absolute():
         candidates += [above / path for above in folder.parents]
-    elif run.exists and (then := read_progress(run).get("folder")):
+    elif run.exists and (then := read_progress(run).folder):
         candidates.append((folder / os.path.relpath(path, then)).resolve())
     found = next((each for each in candidates if each.exists()), candidates[0])
     if found != candidates[0]:
@@ -205,10 +205,11 @@ def load_checkpoint(run: Run) -> tuple[Avatar, TrainConfig, dict[str, str]]:
     path = run.checkpoint / "avatar.safetensors"
     with reading(path):
         content = path.read_bytes()
-        made = _avatar(_tensors(content), config, path)
-    name = Path(progress["folder"]).name if "folder" in progress else run.folder.resolve().name
+        tensors = rename_tensors(_tensors(content), progress.format_version)
+        avatar = _avatar(tensors, config, path)
+    name = Path(progress.folder).name if progress.folder else run.folder.resolve().name
     digest = hashlib.sha256(content).hexdigest()[:16]
-    return made, config, {"checkpoint": digest, "run": name, "step": str(progress["step"])}
+    return avatar, config, {"checkpoint": digest, "run": name, "step": str(progress.step)}
 
 
 def _without_checkpoint(run: Run) -> str:
@@ -248,94 +249,55 @@ def _avatar(tensors: dict[str, Tensor], config: TrainConfig, path: Path) -> Avat
     return avatar.eval()
 
 
-def save_avatar(avatar: Avatar, folder: Path) -> None:
-    """Write the avatar's parameters and everything needed to rebuild it."""
-    tensors = {name: value.detach().contiguous() for name, value in avatar.state_dict().items()}
-    tensors["atlas_size"] = torch.tensor(avatar.atlas_size)
-    tensors["charts"] = encode_charts(avatar.charts)
-    tensors["fps"] = torch.tensor(avatar.fps, dtype=torch.float64)
-    save_file(tensors, folder / "avatar.safetensors")
-
-
-def save_optimizers(optimizers: Mapping[str, torch.optim.Optimizer], folder: Path) -> None:
-    """Write the optimisers' moments; the parameters' order is the key."""
-    for label, optimizer in optimizers.items():
-        state = optimizer.state_dict()["state"]
-        tensors = {f"{index}.{name}": value for index, slot in state.items() for name, value in slot.items()}
-        save_file(tensors, folder / f"{label}.safetensors")
-
-
-def load_optimizers(optimizers: Mapping[str, torch.optim.Optimizer], folder: Path) -> None:
-    """Restore what `save_optimizers` wrote."""
-    for label, optimizer in optimizers.items():
-        state: dict[int, dict[str, Tensor]] = {}
-        path = folder / f"{label}.safetensors"
-        parameters = [each for group in optimizer.param_groups for each in group["params"]]
-        with reading(path):
-            for key, value in read_tensors(path).items():
-                index, name = key.split(".", 1)
-                if value.ndim and value.shape != parameters[int(index)].shape:
-                    raise ValueError(f"{key} has shape {tuple(value.shape)}, its parameter another")
-                state.setdefault(int(index), {})[name] = value
-            optimizer.load_state_dict({**optimizer.state_dict(), "state": state})
-
-
-def save_rollouts(folder: Path, rank: int, tensors: Mapping[str, Tensor], places: Any) -> None:
-    """Write one worker's carried state."""
-    # Some tensors are one (the newest offset is state and record); the file format wants each by itself.
-    copies = {
-        name: tensor.detach().clone(memory_format=torch.contiguous_format) for name, tensor in tensors.items()
+def describe_avatar(avatar: Avatar) -> dict[str, Tensor]:
+    """Return what `load_checkpoint` needs besides the avatar's parameters to rebuild it."""
+    return {
+        "atlas_size": torch.tensor(avatar.atlas_size),
+        "charts": encode_charts(avatar.charts),
+        "fps": torch.tensor(avatar.fps, dtype=torch.float64),
     }
-    save_file(copies, folder / f"rollouts-{rank}.safetensors")
-    (folder / f"rollouts-{rank}.json").write_text(json.dumps(places))
 
 
-def load_rollouts(folder: Path, rank: int) -> tuple[dict[str, Tensor], Any]:
-    """Restore what `save_rollouts` wrote.
+@dataclasses.dataclass(frozen=True)
+class CheckpointProgress:
+    """Where a run stood when its checkpoint was written."""
+
+    format_version: int
+    """Of the checkpoint's files."""
+    step: int
+    """Updates done."""
+    progress: float
+    """Share of the schedule that is done, in [0, 1]."""
+    folder: str | None = None
+    """The run's folder at that time; older checkpoints do not say it."""
+
+
+def write_progress(folder: Path, step: int, progress: float, run: Run) -> None:
+    """Write where the run stands; written last, it marks a checkpoint as complete."""
+    # What the run refers to by path is found again from its folder, when all of it is moved.
+    content = CheckpointProgress(FORMAT_VERSION, step, progress, str(run.folder.resolve()))
+    (folder / "progress.json").write_text(json.dumps(dataclasses.asdict(content)))
+
+
+def read_progress(run: Run) -> CheckpointProgress:
+    """Return where a run's checkpoint stands.
 
     Raises:
-        CheckpointError: the run was trained by another number of workers.
+        CheckpointError: the file is missing or damaged, or the checkpoint is of a format that is not read.
     """
-    path = folder / f"rollouts-{rank}.safetensors"
-    if not path.exists():
-        raise CheckpointError(f"{folder} has no state of worker {rank}; resume with the run's own --workers")
-    places = folder / f"rollouts-{rank}.json"
-    with reading(places):
-        return read_tensors(path), json.loads(decode_text(places.read_bytes()))
-
-
-def save_registration(folder: Path, rank: int, tensors: Mapping[str, Tensor]) -> None:
-    """Write one worker's registered maps."""
-    save_file(dict(tensors), folder / f"registration-{rank}.safetensors")
-
-
-def load_registration(folder: Path, rank: int) -> dict[str, Tensor]:
-    """Restore what `save_registration` wrote."""
-    return read_tensors(folder / f"registration-{rank}.safetensors")
-
-
-def save_progress(folder: Path, step: int, progress: float, run: Run) -> None:
-    """Write where the run stands; written last, it marks a checkpoint as complete."""
-    content = {"format_version": FORMAT_VERSION, "step": step, "progress": progress}
-    # What the run refers to by path is found again from here, when all of it is moved.
-    content |= {"folder": str(run.folder.resolve())}
-    (folder / "progress.json").write_text(json.dumps(content))
-
-
-def read_progress(run: Run) -> dict[str, Any]:
-    """Return step and progress of a run's checkpoint, and in new ones the run's folder at that time."""
     path = run.checkpoint / "progress.json"
     content = read_json(path)
-    if content.get("format_version", FORMAT_VERSION) != FORMAT_VERSION:
+    version = content.get("format_version", FORMAT_VERSION)
+    if version not in range(OLDEST_VERSION, FORMAT_VERSION + 1):
         raise CheckpointError(
-            f"{run.checkpoint} has format {content['format_version']}, this version reads {FORMAT_VERSION}"
+            f"{run.checkpoint} has format {version}, this version reads {OLDEST_VERSION} to {FORMAT_VERSION}"
         )
     kinds = {"format_version": int, "step": int, "progress": int | float, "folder": str}
     with reading(path):
         for key, kind in kinds.items():
             if not isinstance(content.get(key, "" if key == "folder" else None), kind):
                 raise TypeError(f"{key} is {content.get(key)!r}")
-    return content
+        return CheckpointProgress(**{key: content[key] for key in kinds if key in content})
 
 
 def check_files(run: Run) -> None:

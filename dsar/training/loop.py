@@ -1,12 +1,7 @@
 """The training loop: read it from top to bottom."""
 
 import dataclasses
-import logging
-import shutil
-import signal
-import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 
@@ -14,28 +9,29 @@ import numpy as np
 import torch
 from torch import nn
 
-from dsar.atomic_files import naming_storage_errors, write_text_atomically
+from dsar.atomic_files import write_text_atomically
 from dsar.avatar.avatar import Avatar
+from dsar.avatar.driving import DrivingSignal
 from dsar.avatar.rest_frames import find_rest_frames
 from dsar.config import TrainConfig, config_to_json, with_absolute_paths
 from dsar.data.captures.formats import capture_of
-from dsar.data.captures.multiview import MultiViewCapture
 from dsar.errors import CaptureError, CheckpointError, ConfigError, TrainingError
 from dsar.metrics.lpips import load_lpips
-from dsar.training import checkpoint as ckpt
 from dsar.training import workers
 from dsar.training.budget import check_budget
-from dsar.training.checkpoint import Run
-from dsar.training.chunk import ChunkTrainer, UpdateMetrics
-from dsar.training.optimizers import make_optimizers, set_rates
+from dsar.training.checkpoint import Run, check_files, load_checkpoint, read_config, read_progress
+from dsar.training.chunk import ChunkTrainer
+from dsar.training.optimizers import set_rates
+from dsar.training.pace import Clock, leave, stop_signals
 from dsar.training.registration import Registration
-from dsar.training.report import REPORT_EVERY, Monitor, Reporter
-from dsar.training.rest import RestOffsets
-from dsar.training.scene import read_scene, scene_of_capture, write_scene
-from dsar.training.schedule import ScheduleState, schedule_at
+from dsar.training.report import REPORT_EVERY, Monitor, Reporter, UpdateMetrics
+from dsar.training.resuming import check_same_settings, resumed_settings, with_body
+from dsar.training.scene import scene_of_capture, write_scene
+from dsar.training.schedule import ScheduleState, schedule_at, without_pretraining
+from dsar.training.state import TrainingState
+from dsar.training.state_files import read_checkpoint, write_checkpoint
 from dsar.types import Capture
 
-_log = logging.getLogger(__name__)
 SAVE_EVERY = 200
 """Updates between checkpoints (not seconds: all workers must agree)."""
 STILL_FRAMES = 16
@@ -61,7 +57,7 @@ def train(config: TrainConfig, run: Run, *, resume: bool = False, report: Report
     config = with_absolute_paths(config)
     if resume and config.body is None:
         # What came from the environment was written down, and the environment may be another now.
-        config = dataclasses.replace(config, body=ckpt.read_config(run).body)
+        config = dataclasses.replace(config, body=read_config(run).body)
     whole = capture_of(config)
     capture = whole.with_cameras(config.cameras)
     if config.schedule.views > len(capture.cameras):
@@ -70,9 +66,9 @@ def train(config: TrainConfig, run: Run, *, resume: bool = False, report: Report
         )
     config = with_body(config, capture)
     if resume:
-        ckpt.check_files(run)
+        check_files(run)
         check_same_settings(config, resumed_settings(run, config, whole), run)
-    done = ckpt.read_progress(run)["progress"] if resume else 0.0
+    done = read_progress(run).progress if resume else 0.0
     check_budget(config, workers.local_count(config.workers), done, capture.kept_bytes)
     write_scene(run.scene, scene_of_capture(whole))
     write_text_atomically(run.config, config_to_json(config))
@@ -80,102 +76,65 @@ def train(config: TrainConfig, run: Run, *, resume: bool = False, report: Report
     return run
 
 
-def with_body(config: TrainConfig, capture: MultiViewCapture) -> TrainConfig:
-    """Return the settings with the body file that came from the environment written down."""
-    path = capture.body_path
-    if config.body is not None or path is None or path.resolve().is_relative_to(capture.root.resolve()):
-        return config
-    return dataclasses.replace(config, body=str(path.resolve()))
-
-
-def resumed_settings(run: Run, config: TrainConfig, capture: MultiViewCapture) -> TrainConfig:
-    """Return the settings of a run; with the capture that is given now, if it is the same, moved."""
-    saved = ckpt.read_config(run)
-    if config.capture != saved.capture and run.scene.exists():
-        if not read_scene(run.scene).is_of(scene_of_capture(capture)):
-            return saved
-        _log.info("Run %s: its capture was %s and is %s now", run.folder, saved.capture, config.capture)
-        return dataclasses.replace(saved, capture=config.capture)
-    return saved
-
-
-def check_same_settings(config: TrainConfig, saved: TrainConfig, run: Run) -> None:
-    """Raise ConfigError where a resumed run would change a setting other than its length."""
-    length = {"steps": config.schedule.steps, "minutes": config.schedule.minutes}
-    saved = dataclasses.replace(saved, schedule=dataclasses.replace(saved.schedule, **length))
-    asked, had = dataclasses.asdict(config), dataclasses.asdict(saved)
-    changed = sorted(key for key in asked if asked[key] != had[key])
-    if changed:
-        raise ConfigError(
-            f"--resume: {run.config} was made with other values of {', '.join(changed)}; repeat the command "
-            "that started the run, or start another with a new --out"
-        )
-
-
 def _train(config: TrainConfig, folder: Path, resume: bool, report: Reporter | None) -> None:
+    """Train in one worker, from the capture to the last checkpoint."""
     torch.manual_seed(config.seed)
-    run = Run(folder)
-    capture = capture_of(config).with_cameras(config.cameras)
+    run, capture = Run(folder), capture_of(config).with_cameras(config.cameras)
     if resume:
-        avatar, _, _ = ckpt.load_checkpoint(run)
+        avatar, _, _ = load_checkpoint(run)
     else:
         avatar = Avatar.from_capture(capture, capture.body, config.atlas, config.model)
     lpips = load_lpips("alex") if config.loss.lpips else None
-    trainer = ChunkTrainer(config, capture, avatar.train(), training_clips(capture), lpips)
-    rest = RestOffsets(avatar, still_frames(trainer, avatar.fps))
-    registration = Registration(config, capture, avatar, rest, trainer.signals, trainer.rollouts.clips)
-    schedule = registration.reduced(config.schedule)
-    optimizers = make_optimizers(avatar, rest, config.schedule)
-    gradients = workers.Gradients([*avatar.parameters(), *rest.parameters()])
-    step, progress = 0, 0.0
+    clips = training_clips(capture)
+    signals = {name: avatar.driving_signal(capture.motions[name]) for name in clips}
+    still = rest_frames(capture, signals, clips, avatar.fps)
+    state = TrainingState.begin(config, capture, avatar.train(), clips, still)
+    trainer = ChunkTrainer(config, capture, state, signals, lpips)
+    registration = Registration(config, capture, avatar, state.rest, state.registered, signals)
+    gradients = workers.Gradients([*avatar.parameters(), *state.rest.parameters()])
     if resume:
-        at = ckpt.read_progress(run)
-        step, progress = at["step"], at["progress"]
-        ckpt.load_optimizers(optimizers, run.checkpoint)
-        with ckpt.reading(run.checkpoint / f"rollouts-{workers.rank()}.safetensors"):
-            trainer.load_state_dict(*ckpt.load_rollouts(run.checkpoint, workers.rank()))
-        with ckpt.reading(run.checkpoint / f"registration-{workers.rank()}.safetensors"):
-            registration.load_state_dict(ckpt.load_registration(run.checkpoint, workers.rank()))
-        trainer.registered = registration.result
+        read_checkpoint(run, state)
+    schedule = config.schedule if state.registered.clips else without_pretraining(config.schedule)
     clock, used, stop = Clock(schedule.minutes), 0.0, False
-    monitor = Monitor(run.metrics, schedule.steps, report, began=progress)
-    with _stop_signals() as received:
-        while progress < 1:
+    monitor = Monitor(run.metrics, schedule.steps, report, began=state.progress)
+    with stop_signals() as received:
+        while state.progress < 1:
             if stop:
-                save(run, avatar, optimizers, trainer, registration, step, progress)
-                _leave(received)
+                write_checkpoint(run, state)
+                leave(received)
                 return
-            now = schedule_at(schedule, progress)
-            if now.stage != "template" and not registration.complete:
-                show = partial(monitor.show, step, progress, "registration")
+            now = schedule_at(schedule, state.progress)
+            if now.stage != "template" and not state.registered.complete:
+                show = partial(monitor.show, state.step, state.progress, "registration")
                 stop, used = _register(registration, gradients, received, clock, used, show)
-                trainer.registered = registration.result
                 continue
-            set_rates(optimizers, now)
-            rng = np.random.default_rng([config.seed, workers.rank(), step])
+            set_rates(state.optimizers, now)
+            rng = np.random.default_rng([config.seed, workers.rank(), state.step])
             gradients.clear()
-            done = _backward(trainer, rest, rng, now, step)
-            monitor.update(done)
+            metrics = _backward(trainer, rng, now, state.step)
+            monitor.update(metrics)
             before, (stop, used) = used, gradients.average(bool(received), clock.used())
             if not gradients.buffer.isfinite().all():
-                raise TrainingError(f"step {step}: the gradient of {bad_gradient(avatar)} is not finite")
+                bad = _bad_gradient(avatar)
+                raise TrainingError(f"step {state.step}: the gradient of {bad} is not finite")
             nn.utils.clip_grad_norm_(avatar.network.parameters(), config.schedule.max_gradient_norm)
-            for optimizer in optimizers.values():
+            for optimizer in state.optimizers.values():
                 optimizer.step()
             clock.start()
-            step += 1
-            progress = max(step / schedule.steps, progress + (used - before) * registration.schedule_speedup)
-            if workers.rank() == 0 and (step % REPORT_EVERY == 0 or progress >= 1):
-                monitor.write(step, progress, now.stage, clock.seconds())
-            if progress >= 1 or step % SAVE_EVERY == 0:
-                save(run, avatar, optimizers, trainer, registration, step, progress)
+            state.step += 1
+            speedup = state.registered.schedule_speedup(schedule.template_fraction)
+            state.progress = max(state.step / schedule.steps, state.progress + (used - before) * speedup)
+            if workers.rank() == 0 and (state.step % REPORT_EVERY == 0 or state.progress >= 1):
+                monitor.write(state.step, state.progress, now.stage, clock.seconds())
+            if state.progress >= 1 or state.step % SAVE_EVERY == 0:
+                write_checkpoint(run, state)
 
 
 def _register(
     registration: Registration,
     gradients: workers.Gradients,
     received: list[int],
-    clock: "Clock",
+    clock: Clock,
     before: float,
     show: Callable[[float, UpdateMetrics], None],
 ) -> tuple[bool, float]:
@@ -184,32 +143,29 @@ def _register(
     `before` is the time used when they were begun.
     """
     # Clocks differ by a little, but all workers must agree: only numbers that they share count.
-    began = registration.budget_used - before
+    maps = registration.maps
+    began = maps.budget_used - before
     registration.avatar.unhide_covered_texels()
     stop, used = False, 0.0
-    while not (stop or registration.complete):
-        done = registration.fit_next()
+    while not (stop or maps.complete):
+        metrics = registration.fit_next()
         gradients.clear()
         stop, used = gradients.average(bool(received), clock.used())
-        registration.budget_used = began + used
-        if done is not None and registration.count % REPORT_EVERY == 0:
-            show(clock.seconds(), done)
-    if registration.complete:
-        registration.all_gather()
+        maps.budget_used = began + used
+        if metrics is not None and maps.count % REPORT_EVERY == 0:
+            show(clock.seconds(), metrics)
+    if maps.complete:
+        maps.all_gather()
     return stop, used
 
 
 def _backward(
-    trainer: ChunkTrainer,
-    rest: RestOffsets,
-    rng: np.random.Generator,
-    now: ScheduleState,
-    step: int,
+    trainer: ChunkTrainer, rng: np.random.Generator, now: ScheduleState, step: int
 ) -> UpdateMetrics:
     """Compute the gradients of one update."""
     try:
         if now.stage == "template":
-            return trainer.backward_template(rng, rest, now.reduction)
+            return trainer.backward_template(rng, now.reduction)
         if now.stage == "pretraining":
             return trainer.backward_pretraining(rng)
         return trainer.backward_chunk(rng, now, probe=workers.rank() == 0 and step % PROBE_EVERY == 0)
@@ -229,105 +185,20 @@ def training_clips(capture: Capture) -> dict[str, range]:
     return clips
 
 
-def still_frames(trainer: ChunkTrainer, fps: float) -> list[tuple[str, int]]:
-    """Return the near-rest training frames that the template is fitted to."""
-    clips = trainer.rollouts.clips
-    transforms = {name: trainer.signals[name].transforms[: clip.stop] for name, clip in clips.items()}
+def rest_frames(
+    capture: Capture,
+    signals: Mapping[str, DrivingSignal],
+    clips: Mapping[str, range],
+    fps: float,
+) -> list[tuple[str, int]]:
+    """Return sequence and frame of the near-rest training frames that the template is fitted to."""
+    transforms = {name: signals[name].transforms[: clip.stop] for name, clip in clips.items()}
     per_sequence = max(1, -(-STILL_FRAMES // len(clips)))
-    return find_rest_frames(
-        transforms, fps, STILL_FRAMES, per_sequence, trainer.loader.capture.cameras_with_image
-    )
+    return find_rest_frames(transforms, fps, STILL_FRAMES, per_sequence, capture.cameras_with_image)
 
 
-def bad_gradient(avatar: Avatar) -> str:
+def _bad_gradient(avatar: Avatar) -> str:
     """Return the name of the first parameter whose gradient is not finite."""
     named = avatar.named_parameters()
     bad = (name for name, p in named if p.grad is not None and not p.grad.isfinite().all())
     return next(bad, "the still frames' offsets")
-
-
-def save(
-    run: Run,
-    avatar: Avatar,
-    optimizers: Mapping[str, torch.optim.Optimizer],
-    trainer: ChunkTrainer,
-    registration: Registration,
-    step: int,
-    progress: float,
-) -> None:
-    """Write a complete checkpoint, every worker its own rollouts, and put it in place at once.
-
-    Raises:
-        StorageError: the system does not take it; the checkpoint before it stays.
-    """
-    folder = run.folder / "checkpoint.tmp"
-    with naming_storage_errors(run.checkpoint), _removed_on_failure(folder):
-        if workers.rank() == 0:
-            shutil.rmtree(folder, ignore_errors=True)
-            folder.mkdir()
-            ckpt.save_avatar(avatar, folder)
-            ckpt.save_optimizers(optimizers, folder)
-        workers.barrier()
-        ckpt.save_rollouts(folder, workers.rank(), *trainer.state_dict())
-        ckpt.save_registration(folder, workers.rank(), registration.state_dict())
-        workers.barrier()
-        if workers.rank() == 0:
-            ckpt.save_progress(folder, step, progress, run)
-            ckpt.replace_folder(folder, run.checkpoint)
-        workers.barrier()
-
-
-@contextmanager
-def _removed_on_failure(folder: Path) -> Iterator[None]:
-    """Give back the room that half a checkpoint takes."""
-    try:
-        yield
-    except BaseException:
-        shutil.rmtree(folder, ignore_errors=True)
-        raise
-
-
-class Clock:
-    """The time since the first update, which compiles kernels where they never ran before."""
-
-    def __init__(self, minutes: float | None) -> None:
-        self.minutes = minutes
-        self.began: float | None = None
-
-    def start(self) -> None:
-        """Begin to count, unless it has begun."""
-        self.began = self.began if self.began is not None else time.monotonic()
-
-    def seconds(self) -> float:
-        """Return the seconds counted."""
-        return 0.0 if self.began is None else time.monotonic() - self.began
-
-    def used(self) -> float:
-        """Return the share of the budget used; 0 without a budget."""
-        return 0.0 if self.minutes is None else self.seconds() / (60 * self.minutes)
-
-
-@contextmanager
-def _stop_signals() -> Iterator[list[int]]:
-    """Collect SIGINT and SIGTERM in the first worker; the others follow it and ignore the keyboard."""
-    received: list[int] = []
-    first = workers.rank() == 0
-
-    def note(number: int, _frame: object) -> None:
-        if first:
-            received.append(number)
-
-    before = {number: signal.signal(number, note) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield received
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-def _leave(received: list[int]) -> None:
-    """End training in the way that the signal asks for."""
-    if signal.SIGTERM in received:
-        raise SystemExit(128 + signal.SIGTERM)
-    if received:
-        raise KeyboardInterrupt

@@ -7,7 +7,7 @@ maps that follow it through a sequence keep its place, and are the network's fir
 
 import dataclasses
 import functools
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 import torch
@@ -17,20 +17,19 @@ from torch import Tensor
 from dsar.avatar.avatar import Avatar
 from dsar.avatar.driving import DrivingSignal
 from dsar.body.skinning import blend_transforms
-from dsar.config import ScheduleConfig, TrainConfig
+from dsar.config import TrainConfig
 from dsar.geometry.cameras import project
 from dsar.raster import rasterize, reduced_dilation
 from dsar.training import workers
-from dsar.training.chunk import UpdateMetrics
 from dsar.training.losses import image_loss, spatial_loss
+from dsar.training.registered_maps import RegisteredMaps
+from dsar.training.report import UpdateMetrics
 from dsar.training.rest import RestOffsets
 from dsar.training.targets import Target, load_target
 from dsar.types import Capture
 
 REDUCTION = 2
 """Factor by which images are reduced."""
-LIMIT = 0.4
-"""Largest share of a budget of time; frames that are left by then stay without a map."""
 RATE, FAST_RATE = 0.01, 0.025
 """Adam's step, metres, usually and where the cloth is fast."""
 STEPS = 12
@@ -53,7 +52,7 @@ neighbours together, would also hold back a hem that swings away from the waist.
 
 
 class Registration:
-    """The offset maps of all training frames, and one worker's share of the work to fit them."""
+    """One worker's share of the work to fit the registered maps."""
 
     def __init__(
         self,
@@ -61,82 +60,32 @@ class Registration:
         capture: Capture,
         avatar: Avatar,
         rest: RestOffsets,
+        maps: RegisteredMaps,
         signals: Mapping[str, DrivingSignal],
-        clips: Mapping[str, range],
     ) -> None:
-        """Prepare to fit the frames of `clips`, of which each worker gets its share."""
+        """Prepare to fit this worker's frames of `maps`.
+
+        Args:
+            config: The settings of the run.
+            capture: Its images.
+            avatar: With a template that is fitted.
+            rest: The garment in still frames.
+            maps: What is fitted; those of this worker's sequences change.
+            signals: Driving signals of the sequences.
+        """
         self.capture, self.avatar, self.signals, self.seed = capture, avatar, signals, config.seed
-        self.rest = rest
-        self.schedule = config.schedule
+        self.rest, self.maps = rest, maps
         self.loss = dataclasses.replace(config.loss, **STRUCTURE)
         self.garment = avatar.garment_control_points()
-        wanted = clips if config.schedule.pretraining_fraction and len(self.garment) else {}
-        shares = divide_sequences(wanted, workers.world_size())
-        self.longest = max(sum(len(clips[name]) for name in share) for share in shares)
-        self.frames = [(name, frame) for name in shares[workers.rank()] for frame in clips[name]]
-        self.starts = {name: clip.start for name, clip in wanted.items()}
-        self.order = list(clips)
-        self.count = 0
-        """Frames fitted by the busiest worker."""
-        self.budget_used = 0.0
-        """Share of the budget of time that was used."""
-        self.offsets = {
-            name: torch.zeros(len(signals[name]), len(avatar.control.cells), 3) for name in wanted
-        }
-        self.fitted = {name: torch.zeros((), dtype=torch.int64) for name in wanted}
-        self.unseen = {
-            name: frozenset(frame for frame in clip if not capture.cameras_with_image(name, frame))
-            for name, clip in wanted.items()
-        }
-        """Frames that no camera saw: their maps carry the cloth on and teach nothing."""
-
-    @property
-    def complete(self) -> bool:
-        """Whether every worker has fitted its frames, or time is up."""
-        return self.count >= self.longest or self.budget_used >= LIMIT
-
-    @property
-    def result(self) -> dict[str, tuple[Collection[int], Float[Tensor, "_ p 3"]]]:
-        """The frames of each sequence that have a map, and the maps at the control points, metres."""
-        fitted = {name: range(start, start + int(self.fitted[name])) for name, start in self.starts.items()}
-        frames = {name: set(each) - self.unseen[name] for name, each in fitted.items()}
-        return {name: (frames[name], maps) for name, maps in self.offsets.items() if frames[name]}
-
-    @property
-    def schedule_speedup(self) -> float:
-        """Factor by which the stages after it must advance faster than time for what it took."""
-        left = 1 - self.schedule.template_fraction
-        return left / (left - self.budget_used) if self.complete else 1.0
-
-    def reduced(self, schedule: ScheduleConfig) -> ScheduleConfig:
-        """Return the schedule, without pre-training where there is no garment to register."""
-        return schedule if self.offsets else dataclasses.replace(schedule, pretraining_fraction=0.0)
-
-    def all_gather(self) -> None:
-        """Give all workers what each has fitted."""
-        workers.all_reduce([*self.offsets.values(), *self.fitted.values()])
-        self.count, self.frames = self.longest, []
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """Return what must survive a restart."""
-        tensors = {f"offsets.{name}": maps for name, maps in self.offsets.items()}
-        tensors |= {f"fitted.{name}": fitted for name, fitted in self.fitted.items()}
-        tensors["rest"] = self.rest.offsets.detach()
-        return tensors | {"count": torch.tensor(self.count), "used": torch.tensor(self.budget_used)}
-
-    def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restore what `state_dict` returned."""
-        self.offsets = {name: tensors[f"offsets.{name}"] for name in self.offsets}
-        self.fitted = {name: tensors[f"fitted.{name}"] for name in self.fitted}
-        with torch.no_grad():
-            self.rest.offsets.copy_(tensors["rest"])
-        self.count, self.budget_used = int(tensors["count"]), float(tensors["used"])
+        own = maps.shares[workers.rank()]
+        self.frames = [(name, frame) for name in own for frame in maps.clips[name]]
+        self.order = list(maps.clips)
 
     def fit_next(self) -> UpdateMetrics | None:
         """Fit this worker's next frame, if it has one left."""
-        place = self.frames[self.count] if self.count < len(self.frames) else None
-        self.count += 1
-        return self.fit(*place) if place is not None else None
+        index = self.maps.count
+        self.maps.count += 1
+        return self.fit(*self.frames[index]) if index < len(self.frames) else None
 
     def fit(self, name: str, frame: int) -> UpdateMetrics | None:
         """Fit the map of a frame; those before it are fitted. Cloth that no camera saw stays as it was."""
@@ -147,9 +96,9 @@ class Registration:
         view = functools.cache(functools.partial(self._view, name, frame, points=points))
         cameras = self.capture.cameras_with_image(name, frame)
         if not cameras:
-            if frame > self.starts[name]:
-                self.offsets[name][frame] = self.offsets[name][frame - 1]
-            self.fitted[name] += 1
+            if frame > self.maps.clips[name].start:
+                self.maps.offsets[name][frame] = self.maps.offsets[name][frame - 1]
+            self.maps.fitted[name] += 1
             return None
 
         def some_views() -> list[tuple[Target, float]]:
@@ -166,8 +115,8 @@ class Registration:
             loss = loss + JOLT * self._roughness(offset - guess)
             loss.backward(inputs=[offset])
             optimizer.step()
-        self.offsets[name][frame, self.garment] = offset.detach()
-        self.fitted[name] += 1
+        self.maps.offsets[name][frame, self.garment] = offset.detach()
+        self.maps.fitted[name] += 1
         return UpdateMetrics(float(loss.detach()), float(mse))
 
     @torch.no_grad()
@@ -186,11 +135,11 @@ class Registration:
 
         Rest is among them, so that a print that was lost is found again when the cloth comes to rest.
         """
-        garment, seen = self.garment, frame - self.starts[name]
+        garment, seen = self.garment, frame - self.maps.clips[name].start
         rest = self.rest.earliest(name)
         if seen == 0:
             return [rest], False
-        before = self.offsets[name][frame - 1, garment]
+        before = self.maps.offsets[name][frame - 1, garment]
         if seen == 1:
             return [before, rest], False
         change = self._inertia(motion_window, name, frame) - before
@@ -202,7 +151,7 @@ class Registration:
     def _inertia(self, motion_window: Tensor, name: str, frame: int) -> Float[Tensor, "g 3"]:
         """Return the offsets of cloth that moves on through the world as it did before this frame."""
         avatar, garment, signal = self.avatar, self.garment, self.signals[name]
-        past = self.offsets[name]
+        past = self.maps.offsets[name]
         newest, older = (self._posed(signal.windows[[f]], past[f, garment]) for f in (frame - 1, frame - 2))
         moved = newest + self._smooth(newest - older)
         blended = blend_transforms(avatar.control.weights[garment], motion_window[:, :1])[0, 0]
@@ -257,11 +206,3 @@ class Registration:
         for a, b in (avatar.control.edges.T, avatar.control.edges.T.flip(0)):
             total.index_add_(0, a, spread[b])
         return (total[:, :3] / total[:, 3:].clamp_min(1))[self.garment]
-
-
-def divide_sequences(clips: Mapping[str, range], workers: int) -> list[list[str]]:
-    """Return which sequences each worker gets, so that none has much more to do than another."""
-    shares: list[list[str]] = [[] for _ in range(workers)]
-    for name in sorted(clips, key=lambda name: -len(clips[name])):
-        min(shares, key=lambda share: sum(len(clips[n]) for n in share)).append(name)
-    return shares

@@ -10,7 +10,6 @@ from pathlib import Path
 
 from dsar.atomic_files import naming_storage_errors
 from dsar.metrics.images import decibels
-from dsar.training.chunk import UpdateMetrics
 
 _log = logging.getLogger(__name__)
 REPORT_EVERY = 20
@@ -18,6 +17,19 @@ REPORT_EVERY = 20
 _LEAST_SHARE, _LARGEST_SHARE = 1e-4, 1.0
 _NEW = 0.05
 """Weight of the newest update in smoothed values."""
+
+
+@dataclass(frozen=True)
+class UpdateMetrics:
+    """What one update says of itself."""
+
+    loss: float
+    """Total loss per rendered view."""
+    mse: float | None
+    """Mean squared colour error per view, over the crop and a random background; None without images."""
+    gradients: dict[str, float] | None = None
+    """Norms of the regularisers' gradients by the first convolution as shares of L_render's; None where
+    they were not compared."""
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """Where a run stands: the three stages and everything that changes with progress."""
 
+import dataclasses
 import math
 from dataclasses import dataclass
 from typing import Literal
@@ -53,6 +54,11 @@ def schedule_at(schedule: ScheduleConfig, progress: float) -> ScheduleState:
     doublings = int(grown * 8)
     max_rollout_frames = max_rollout_frames * 2**doublings if doublings < 4 else WHOLE_CLIP
     return ScheduleState("autoregressive", max_rollout_frames, reduction, *rates, factor)
+
+
+def without_pretraining(schedule: ScheduleConfig) -> ScheduleConfig:
+    """Return the schedule of a run that has no registered maps to train on."""
+    return dataclasses.replace(schedule, pretraining_fraction=0.0)
 
 
 def _rates(schedule: ScheduleConfig, trained: float, scale: float = 1.0) -> tuple[float, float]:

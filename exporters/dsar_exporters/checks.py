@@ -80,41 +80,41 @@ def checked_frames(sequence: GaussianSequence) -> Iterator[tuple[int, Gaussians]
         ExportError: A frame has another number of Gaussians than the sequence says, another number of
             harmonics than the first frame, or a value that is not finite or not what its field holds.
     """
-    harmonics_count, sound = None, None
+    harmonics_count, last_finite = None, None
     for frame, gaussians in sequence:
         if len(gaussians) != sequence.num_gaussians:
             raise ExportError(
                 f"frame {frame}: expected {sequence.num_gaussians} Gaussians, found {len(gaussians)}: "
                 "an animated asset needs the same Gaussians in every frame"
             )
-        found = gaussians.harmonics.shape[1]
+        count = gaussians.harmonics.shape[1]
         expected = _HARMONICS_COUNTS if harmonics_count is None else (harmonics_count,)
-        if found not in expected:
-            raise ExportError(f"frame {frame}: expected {expected} harmonics per Gaussian, found {found}")
-        harmonics_count = found
+        if count not in expected:
+            raise ExportError(f"frame {frame}: expected {expected} harmonics per Gaussian, found {count}")
+        harmonics_count = count
         frame_values = gaussians.map(lambda values: values.detach().cpu().to(torch.float32).contiguous())
-        _check_finite(frame, frame_values, sound)
+        _check_finite(frame, frame_values, last_finite)
         _check_ranges(frame, frame_values)
-        sound = frame
+        last_finite = frame
         yield frame, frame_values
 
 
-def _check_finite(frame: int, gaussians: Gaussians, sound: int | None) -> None:
-    """Check a frame's values; `sound` is the last frame before it, whose values were finite, if any."""
+def _check_finite(frame: int, gaussians: Gaussians, last_finite: int | None) -> None:
+    """Check a frame's values; `last_finite` is the last frame before it, whose values were finite, if any."""
     # A sum is finite only where all its terms are; the other way round it may overflow.
     suspects = {name: values for name, values in vars(gaussians).items() if not values.sum().isfinite()}
     broken = {name: int((~values.isfinite()).sum()) for name, values in suspects.items()}
-    found = [f"{name}, found {count} values that are not" for name, count in broken.items() if count]
-    if not found:
+    faults = [f"{name}, found {count} values that are not" for name, count in broken.items() if count]
+    if not faults:
         return
     # The sequence does not say where it comes from: name what it can be, and what speaks for which.
     cause = (
         "the checkpoint or the motion holds such values, or the network made them at once: look at both"
-        if sound is None
-        else f"frame {sound} is finite: the motion holds such values there, or the network made them on the "
-        f"way: look at the motion, or export frames up to {sound}"
+        if last_finite is None
+        else f"frame {last_finite} is finite: the motion holds such values there, or the network made them "
+        f"on the way: look at the motion, or export frames up to {last_finite}"
     )
-    raise ExportError(f"frame {frame}: expected finite {'; finite '.join(found)}: {cause}")
+    raise ExportError(f"frame {frame}: expected finite {'; finite '.join(faults)}: {cause}")
 
 
 def _check_ranges(frame: int, gaussians: Gaussians) -> None:

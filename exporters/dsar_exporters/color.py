@@ -113,22 +113,22 @@ def _check_contents(config: str, contents: str) -> None:
 def _interop_id(colorspace: str, config: str) -> str:
     if (colorspace, config) == (LINEAR_REC709, _BUILT_IN):
         return colorspace
-    found = _open(config)
-    if found.resolve(colorspace) not in found.getColorSpaceNames():
+    ocio = _open(config)
+    if ocio.resolve(colorspace) not in ocio.getColorSpaceNames():
         raise ExportError(
             f"colour space: expected a name, alias or role known to OCIO ({config}), such as {LINEAR_REC709} "
             f"or ACEScg, found {colorspace!r}"
         )
     _source(config)
-    return found.get_color_interop_id(found.resolve(colorspace)) or "unknown"
+    return ocio.get_color_interop_id(ocio.resolve(colorspace)) or "unknown"
 
 
 @lru_cache
 def _source(config: str) -> str:
     """Return the configuration's name for the colours of avatars."""
-    found = _open(config)
-    names = found.getColorSpaceNames()
-    source = next((name for name in _SOURCES if found.resolve(name) in names), None)
+    ocio = _open(config)
+    names = ocio.getColorSpaceNames()
+    source = next((name for name in _SOURCES if ocio.resolve(name) in names), None)
     if source is None:
         raise ExportError(
             f"--ocio {config}: expected a colour space for sRGB textures, found none of "
@@ -141,10 +141,10 @@ def _open(config: str):
     """Return a configuration; not kept, because OpenImageIO complains of any that is left at the end."""
     if not config.startswith("ocio://") and not Path(config).is_file():
         raise ExportError(f"--ocio {config}: expected an OCIO configuration, found no such file")
-    found = _require_oiio().ColorConfig(config)
-    if found.geterror() or not found.getColorSpaceNames():
+    ocio = _require_oiio().ColorConfig(config)
+    if ocio.geterror() or not ocio.getColorSpaceNames():
         raise ExportError(f"--ocio {config}: expected an OCIO configuration, found one that cannot be read")
-    return found
+    return ocio
 
 
 def _converted(

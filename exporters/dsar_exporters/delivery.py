@@ -61,7 +61,7 @@ class Delivery:
     """Spent in writing; the rollout's own time is not in it."""
 
 
-class _Timed:
+class _TimedSink:
     """An output at work, which knows how long it took."""
 
     def __init__(self, output: Output) -> None:
@@ -76,19 +76,19 @@ class _Timed:
 
     def write(self, frame: int, gaussians: Gaussians) -> None:
         """Write a frame."""
-        with self._counted(), naming_storage_errors(self.output.path):
+        with self._timed(), naming_storage_errors(self.output.path):
             self._sink(frame, gaussians)
 
     def close(self) -> None:
         """Put the files in their place."""
-        with self._counted(), naming_storage_errors(self.output.path):
+        with self._timed(), naming_storage_errors(self.output.path):
             self._opened.__exit__(None, None, None)
 
     @contextmanager
-    def _counted(self) -> Iterator[None]:
-        began = time.perf_counter()
+    def _timed(self) -> Iterator[None]:
+        start = time.perf_counter()
         yield
-        self.seconds += time.perf_counter() - began
+        self.seconds += time.perf_counter() - start
 
 
 def export(sequence: GaussianSequence, outputs: Sequence[Output]) -> list[Delivery]:
@@ -107,33 +107,33 @@ def export(sequence: GaussianSequence, outputs: Sequence[Output]) -> list[Delive
         MissingDependencyError: A format's library is not installed.
     """
     check_sequence(sequence)
-    places = [output.path.absolute() for output in outputs]
-    if doubled := {str(place) for place in places if places.count(place) > 1}:
+    paths = [output.path.absolute() for output in outputs]
+    if doubled := {str(path) for path in paths if paths.count(path) > 1}:
         raise ExportError(f"outputs: expected each place once, found {', '.join(doubled)} twice: rename one")
-    sinks: list[_Timed] = []
+    sinks: list[_TimedSink] = []
     with ExitStack() as stack:
         for output in outputs:
-            sink = _Timed(output)
+            sink = _TimedSink(output)
             sinks.append(sink)
             with naming_storage_errors(output.path):
                 # Whatever happens before all frames have passed, happens to every output.
                 stack.push(sink.open(sequence))
-        began = time.perf_counter()
+        start = time.perf_counter()
         for done, (frame, gaussians) in enumerate(checked_frames(sequence), start=1):
             if done == 1:
                 _announce(outputs, gaussians, len(sequence))
             for sink in sinks:
                 sink.write(frame, gaussians)
             if done == _PROBE < len(sequence):
-                left = (time.perf_counter() - began) / done * (len(sequence) - done)
-                _logger.info("About %.0f s left", left)
+                remaining = (time.perf_counter() - start) / done * (len(sequence) - done)
+                _logger.info("About %.0f s left", remaining)
         stack.pop_all()
     return _close(sinks)
 
 
-def _close(sinks: Sequence["_Timed"]) -> list[Delivery]:
+def _close(sinks: Sequence["_TimedSink"]) -> list[Delivery]:
     """Put the files of every output in their place, also where another's cannot be."""
-    found, errors = [], []
+    deliveries, errors = [], []
     for sink in sinks:
         try:
             sink.close()
@@ -142,16 +142,16 @@ def _close(sinks: Sequence["_Timed"]) -> list[Delivery]:
             continue
         files = sink.output.written()
         size = sum(file.stat().st_size for file in files)
-        delivered = Delivery(sink.output.path, len(files), size, sink.seconds)
-        rate = size / _MEGA / max(delivered.seconds, 1e-9)
+        delivery = Delivery(sink.output.path, len(files), size, sink.seconds)
+        rate = size / _MEGA / max(delivery.seconds, 1e-9)
         _logger.info(
             "%s: %.1f MB in %d files, %.1f s (%.0f MB/s)",
-            *(delivered.path, size / _MEGA, len(files), delivered.seconds, rate),
+            *(delivery.path, size / _MEGA, len(files), delivery.seconds, rate),
         )
-        found.append(delivered)
+        deliveries.append(delivery)
     if errors:
         raise errors[0]
-    return found
+    return deliveries
 
 
 _PROBE = 8
@@ -164,7 +164,7 @@ def _announce(outputs: Sequence[Output], first: Gaussians, frames: int) -> None:
     for output in outputs:
         size = output.estimated_bytes(first, frames)
         _logger.info("%s: about %.1f MB", output.path, size / _MEGA)
-        folder = _existing(output.path)
+        folder = _existing_folder(output.path)
         device = folder.stat().st_dev
         needed[device] = needed.get(device, 0) + size
         free = shutil.disk_usage(folder).free
@@ -176,7 +176,7 @@ def _announce(outputs: Sequence[Output], first: Gaussians, frames: int) -> None:
             )
 
 
-def _existing(path: Path) -> Path:
+def _existing_folder(path: Path) -> Path:
     """Return the path, or the nearest one above it, that is a folder."""
     path = path.absolute()
     return next(folder for folder in (path, *path.parents) if folder.is_dir())

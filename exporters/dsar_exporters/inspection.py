@@ -21,8 +21,8 @@ def find_faults(path: Path) -> list[str]:
         MissingDependencyError: Its format's library is not installed.
     """
     if not path.is_file():
-        found = "a folder" if path.is_dir() else "none"
-        raise ExportError(f"{path}: expected a file to check, found {found}: give its path")
+        kind = "a folder" if path.is_dir() else "none"
+        raise ExportError(f"{path}: expected a file to check, found {kind}: give its path")
     suffix = path.suffix.lower()
     if suffix in _USD:
         require("pxr.UsdVol", feature="USD", package="usd-core>=26.3", extra="usd")

@@ -1,8 +1,10 @@
 """The sidecar of an export: what the files are, for people and pipelines that cannot open them."""
 
+import dataclasses
 import importlib.metadata
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,51 @@ from dsar.atomic_files import atomic_write
 from dsar.types import GaussianSequence
 
 _PACKAGES = ("dsar-avatar", "torch", "usd-core", "plyfile", "gsply", "fourdgs")
+_IDS = "index 0 to gaussians - 1: the same Gaussian in every frame and every format that keeps order"
+
+
+@dataclass(frozen=True)
+class FrameRange:
+    """The frames of an export."""
+
+    range: str
+    """As fileseq writes it."""
+    count: int
+    first: int
+    last: int
+    fps: float
+
+    @classmethod
+    def of_sequence(cls, sequence: GaussianSequence) -> "FrameRange":
+        """Return the frames of a sequence."""
+        numbers = list(sequence.frame_numbers)
+        return cls(str(FrameSet(numbers)), len(numbers), numbers[0], numbers[-1], sequence.fps)
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """What `<name>.manifest.json` says, in the order of its keys."""
+
+    frames: FrameRange
+    gaussians: int
+    ids: str = dataclasses.field(
+        default=_IDS,
+        init=False,
+    )
+    units: str = dataclasses.field(default="metres", init=False)
+    up_axis: str = dataclasses.field(default="Y", init=False)
+    color_space: str = dataclasses.field(default="srgb_rec709_display", init=False)
+    half: bool | None
+    """Whether splats are in 16 bits; None where the format knows no such choice, and then it has no key."""
+    provenance: Mapping[str, str]
+    versions: Mapping[str, str]
+    """Of the packages that had a hand in it."""
+    files: Sequence[str]
+    """As seen from the manifest's own folder."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the content of the file."""
+        return {key: value for key, value in dataclasses.asdict(self).items() if value is not None}
 
 
 def manifest_path(path: Path) -> Path:
@@ -22,45 +69,40 @@ def manifest_path(path: Path) -> Path:
 
 
 def write_manifest(
-    path: Path, sequence: GaussianSequence, files: Sequence[Path], facts: Mapping[str, Any]
+    path: Path, sequence: GaussianSequence, files: Sequence[Path], *, half: bool | None = None
 ) -> Path:
     """Write the manifest of a file or folder and return its path.
 
     Args:
         path: The file or folder; a manifest that is there is replaced.
         sequence: What was written.
-        files: Its files; the manifest names them as seen from its own folder.
-        facts: What is true of this format only, such as its axes and colour space.
+        files: Its files.
+        half: Whether splats are in 16 bits, where the format has the choice.
+
+    Raises:
+        StorageError: The system does not take it.
     """
-    numbers = list(sequence.frame_numbers)
-    content = {
-        "frames": {
-            "range": str(FrameSet(numbers)),
-            "count": len(numbers),
-            "first": numbers[0],
-            "last": numbers[-1],
-            "fps": sequence.fps,
-        },
-        "gaussians": sequence.num_gaussians,
-        "ids": "index 0 to gaussians - 1: the same Gaussian in every frame and every format that keeps order",
-        "units": "metres",
-        **facts,
-        "provenance": dict(sequence.provenance),
-        "versions": _versions(),
-        "files": [file.absolute().relative_to(path.absolute().parent).as_posix() for file in files],
-    }
+    folder = path.absolute().parent
+    manifest = Manifest(
+        frames=FrameRange.of_sequence(sequence),
+        gaussians=sequence.num_gaussians,
+        half=half,
+        provenance=dict(sequence.provenance),
+        versions=_versions(),
+        files=[file.absolute().relative_to(folder).as_posix() for file in files],
+    )
     target = manifest_path(path)
     with atomic_write(target) as draft:
-        draft.write_text(json.dumps(content, indent=2) + "\n")
+        draft.write_text(json.dumps(manifest.to_json(), indent=2) + "\n")
     return target
 
 
 def _versions() -> dict[str, str]:
-    """Return the versions of the packages that had a hand in it, those that are installed."""
-    found = {}
+    """Return the versions of those packages that are installed."""
+    versions = {}
     for package in _PACKAGES:
         try:
-            found[package] = importlib.metadata.version(package)
+            versions[package] = importlib.metadata.version(package)
         except importlib.metadata.PackageNotFoundError:
             continue
-    return found
+    return versions

@@ -34,7 +34,7 @@ def hash_config(config: str) -> str:
     for name in sorted(set(_sources(text))):
         for variable, value in sorted(_variables(name, text).items()):
             digest.update(f"\0{variable}={value}".encode())
-        file = _find(_expanded(name, text), path.parent, text)
+        file = _find_file(_expanded(name, text), path.parent, text)
         digest.update(
             f"\0{name}\0".encode() + (b"" if file is None else hashlib.sha256(file.read_bytes()).digest())
         )
@@ -46,17 +46,17 @@ def _sources(text: str) -> Iterator[str]:
         yield next(part for part in match.groups() if part is not None).strip()
 
 
-def _find(name: str, folder: Path, text: str) -> Path | None:
+def _find_file(name: str, folder: Path, text: str) -> Path | None:
     """Return the file of a name, None where there is none: then nothing can be converted through it."""
-    candidates = (folder / place / name for place in ("", *_search_path(text)))
-    return next((each for each in candidates if each.is_file()), None)
+    candidates = (folder / subfolder / name for subfolder in ("", *_search_path(text)))
+    return next((file for file in candidates if file.is_file()), None)
 
 
 def _search_path(text: str) -> Iterator[str]:
     for match in _SEARCH_PATH.finditer(text):
-        places = [match[1] or "", *(line.strip().lstrip("-") for line in (match[2] or "").splitlines())]
-        for place in ":".join(places).split(":"):
-            yield _expanded(place.strip().strip("\"'"), text)
+        folders = [match[1] or "", *(line.strip().lstrip("-") for line in (match[2] or "").splitlines())]
+        for folder in ":".join(folders).split(":"):
+            yield _expanded(folder.strip().strip("\"'"), text)
 
 
 def _expanded(name: str, text: str) -> str:
@@ -68,7 +68,7 @@ def _variables(name: str, text: str) -> dict[str, str | None]:
     """Return the variables in a name: as the environment has them, else by the configuration's defaults."""
     names = [next(filter(None, match.groups())) for match in _VARIABLE.finditer(name)]
     defaults = dict(_DEFAULT.findall(_environment(text)))
-    return {each: os.environ.get(each, defaults.get(each)) for each in names}
+    return {variable: os.environ.get(variable, defaults.get(variable)) for variable in names}
 
 
 def _environment(text: str) -> str:

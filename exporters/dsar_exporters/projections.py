@@ -33,31 +33,35 @@ def read_back_projections(cameras: Sequence[Camera]) -> dict[str, Projections]:
     plain = [dataclasses.replace(camera, name=f"cam_{index}") for index, camera in enumerate(cameras)]
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        stage = write_usd(_speck(), folder / "cameras.usda", name="crosscheck", cameras=plain)
-        found = {"usd": read_usd_projections(stage, {each.name: (each.width, each.height) for each in plain})}
+        stage = write_usd(_single_gaussian(), folder / "cameras.usda", name="crosscheck", cameras=plain)
+        sizes = {camera.name: (camera.width, camera.height) for camera in plain}
+        projections = {"usd": read_usd_projections(stage, sizes)}
         for camera in plain:
             for kind, matrix in read_projections(_write_empty(camera, folder)).items():
-                found.setdefault(kind, {})[camera.name] = matrix
+                projections.setdefault(kind, {})[camera.name] = matrix
     names = {new.name: old.name for new, old in zip(plain, cameras, strict=True)}
-    return {kind: {names[key]: matrix for key, matrix in each.items()} for kind, each in found.items()}
+    return {
+        kind: {names[key]: matrix for key, matrix in matrices.items()}
+        for kind, matrices in projections.items()
+    }
 
 
-def _speck() -> GaussianSequence:
+def _single_gaussian() -> GaussianSequence:
     """Return one Gaussian, for an asset has to hold something."""
-    speck = Gaussians(
+    gaussian = Gaussians(
         means=torch.zeros(1, 3),
         rotations=torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
         scales=torch.full((1, 3), 0.01),
         opacities=torch.ones(1),
         harmonics=torch.zeros(1, 1, 3),
     )
-    return GaussianSequence((_FRAME,), _FPS, 1, lambda: iter([speck]))
+    return GaussianSequence((_FRAME,), _FPS, 1, lambda: iter([gaussian]))
 
 
 def _write_empty(camera: Camera, folder: Path) -> Path:
     """Write an image that holds one pixel, however large the camera's is."""
     size = camera.height, camera.width
-    nothing = RenderOutput(torch.zeros(*size, 3), torch.zeros(size), torch.zeros(size), torch.tensor(0))
+    empty = RenderOutput(torch.zeros(*size, 3), torch.zeros(size), torch.zeros(size), torch.tensor(0))
     files = ExrSequence(folder, layers=("alpha",), crop=True)
-    (path,) = files.write([Picture(_FRAME, camera, nothing, fps=_FPS)], [""])
+    (path,) = files.write([Picture(_FRAME, camera, empty, fps=_FPS)], [""])
     return path

@@ -259,7 +259,7 @@ def test_an_asset_that_cannot_be_put_in_place_leaves_the_older_one(make_sequence
             raise PermissionError(13, "Permission denied")
         replace(source, target)
 
-    monkeypatch.setattr("dsar_exporters.usd.os.replace", fail_at_the_root)
+    monkeypatch.setattr("dsar.atomic_files.os.replace", fail_at_the_root)
     with pytest.raises(StorageError, match=r"a\.usda: cannot be written: Permission denied: write elsewhere"):
         write_usd(make_sequence(frames=3), path, name="new", clips=True)
     assert {each: each.read_bytes() for each in tmp_path.rglob("*") if each.is_file()} == before

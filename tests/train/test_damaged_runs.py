@@ -16,8 +16,7 @@ from dsar.config import config_from_json
 from dsar.errors import CheckpointError, ConfigError
 from dsar.evaluation.report import write_report
 from dsar.training.checkpoint import Run, load_checkpoint, newest_run
-from dsar.training.chunk import UpdateMetrics
-from dsar.training.report import Monitor
+from dsar.training.report import Monitor, UpdateMetrics
 from dsar.training.scene import open_scene
 from tests.conftest import train_arguments
 
@@ -173,7 +172,7 @@ def test_settings_that_are_unknown_missing_or_of_another_kind_are_named(run, cha
 
 
 @pytest.mark.parametrize(
-    "name", ["adam.safetensors", "rollouts-0.safetensors", "rollouts-0.json", "registration-0.safetensors"]
+    "name", ["adam.safetensors", "rollouts-0.safetensors", "muon.safetensors", "registration-0.safetensors"]
 )
 def test_resuming_names_the_damaged_state_before_any_work(run, tiny_capture, capsys, name):
     path = run / "checkpoint" / name

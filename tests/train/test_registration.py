@@ -14,10 +14,12 @@ from dsar.data.captures.formats import open_capture
 from dsar.evaluation.garment_metrics import distance_to_mesh
 from dsar.training import loop
 from dsar.training.chunk import ChunkTrainer
-from dsar.training.optimizers import make_optimizers, set_rates
-from dsar.training.registration import Registration, divide_sequences
+from dsar.training.optimizers import set_rates
+from dsar.training.registered_maps import RegisteredMaps, divide_sequences
+from dsar.training.registration import Registration
 from dsar.training.rest import PULL, RestOffsets
-from dsar.training.schedule import schedule_at
+from dsar.training.schedule import schedule_at, without_pretraining
+from dsar.training.state import TrainingState
 from dsar.training.workers import Gradients
 
 SEQUENCE = "spin_right"
@@ -31,28 +33,30 @@ def registered():
     torch.manual_seed(0)
     config, capture = TrainConfig(), open_capture()
     avatar = Avatar.from_capture(capture, capture.body, config.atlas, config.model)
-    trainer = ChunkTrainer(config, capture, avatar, loop.training_clips(capture), None)
-    rest = RestOffsets(avatar, loop.still_frames(trainer, avatar.fps))
-    optimizers, gradients = (
-        make_optimizers(avatar, rest, config.schedule),
-        Gradients([*avatar.parameters(), *rest.parameters()]),
-    )
+    every = loop.training_clips(capture)
+    signals = {name: avatar.driving_signal(capture.motions[name]) for name in every}
+    still = loop.rest_frames(capture, signals, every, avatar.fps)
+    state = TrainingState.begin(config, capture, avatar, every, still)
+    trainer = ChunkTrainer(config, capture, state, signals, None)
+    gradients = Gradients([*avatar.parameters(), *state.rest.parameters()])
     for step in range(60):
-        set_rates(optimizers, schedule_at(config.schedule, 0.12 * step / 60))
+        set_rates(state.optimizers, schedule_at(config.schedule, 0.12 * step / 60))
         gradients.clear()
-        trainer.backward_template(np.random.default_rng([0, step]), rest, 1)
-        optimizers["adam"].step()
+        trainer.backward_template(np.random.default_rng([0, step]), 1)
+        state.optimizers["adam"].step()
     avatar.unhide_covered_texels()
     clips = {SEQUENCE: range(4, LAST + 1)}
-    registration = Registration(config, capture, avatar, rest, trainer.signals, clips)
-    forgotten = RestOffsets(avatar, rest.frames)
-    copy = Registration(config, capture, avatar, forgotten, trainer.signals, clips)
+    state.registered = RegisteredMaps.begin(config, capture, avatar, clips)
+    registration = Registration(config, capture, avatar, state.rest, state.registered, signals)
+    other = TrainingState.begin(config, capture, avatar, clips, still)
+    copy = Registration(config, capture, avatar, other.rest, other.registered, signals)
     for _ in range(LAST - 5):
         registration.fit_next()
-    copy.load_state_dict({name: tensor.clone() for name, tensor in registration.state_dict().items()})
-    for one in (registration, copy):
-        while not one.complete:
-            one.fit_next()
+    saved = {name: value.clone() for name, value in state.state_dict().items() if "registration." in name}
+    other.load_state_dict(saved)
+    for fitting in (registration, copy):
+        while not fitting.maps.complete:
+            fitting.fit_next()
     return capture, avatar, registration, copy
 
 
@@ -108,6 +112,10 @@ def test_what_keeps_a_garment_in_one_piece(registered):
     assert not rest.earliest("jumps").any()
 
 
+def frames_with_map(maps: RegisteredMaps) -> set[int]:
+    return {frame for frame in range(100) if maps.has_map(SEQUENCE, frame)}
+
+
 def distance_to_cloth(capture, avatar, registration, maps) -> float:
     motion_window = avatar.driving_signal(capture.motions[SEQUENCE]).windows[[LAST]]
     points = registration._posed(motion_window, maps)
@@ -117,8 +125,8 @@ def distance_to_cloth(capture, avatar, registration, maps) -> float:
 
 def test_registered_maps_follow_the_cloth_into_a_spin(registered):
     capture, avatar, registration, _ = registered
-    frames, maps = registration.result[SEQUENCE]
-    assert set(frames) == set(range(4, LAST + 1))
+    maps = registration.maps.offsets[SEQUENCE]
+    assert frames_with_map(registration.maps) == set(range(4, LAST + 1))
     found = maps[LAST, avatar.garment_control_points()]
     assert found.norm(dim=1).mean() > 0.01
     before = distance_to_cloth(capture, avatar, registration, torch.zeros_like(found))
@@ -131,25 +139,24 @@ def test_registered_maps_follow_the_cloth_into_a_spin(registered):
 
 def test_cloth_that_no_camera_saw_stays_as_it_was_and_teaches_nothing(registered, monkeypatch):
     _, _, registration, _ = registered
-    before = registration.offsets[SEQUENCE].clone()
-    fitted = registration.fitted[SEQUENCE].clone()
+    maps = registration.maps
+    before, fitted = maps.offsets[SEQUENCE].clone(), maps.fitted[SEQUENCE].clone()
     monkeypatch.setattr(registration, "capture", SimpleNamespace(cameras_with_image=lambda name, frame: []))
-    monkeypatch.setattr(registration, "unseen", {SEQUENCE: frozenset({LAST})})
+    monkeypatch.setattr(maps, "unseen", {SEQUENCE: frozenset({LAST})})
     try:
         assert registration.fit(SEQUENCE, LAST) is None
-        assert torch.equal(registration.offsets[SEQUENCE][LAST], before[LAST - 1])
-        assert registration.fitted[SEQUENCE] == fitted + 1
-        registration.fitted[SEQUENCE] = fitted
-        assert set(registration.result[SEQUENCE][0]) == set(range(4, LAST))
+        assert torch.equal(maps.offsets[SEQUENCE][LAST], before[LAST - 1])
+        assert maps.fitted[SEQUENCE] == fitted + 1
+        maps.fitted[SEQUENCE] = fitted
+        assert frames_with_map(maps) == set(range(4, LAST))
     finally:
-        registration.offsets[SEQUENCE] = before
-        registration.fitted[SEQUENCE] = fitted
+        maps.offsets[SEQUENCE], maps.fitted[SEQUENCE] = before, fitted
 
 
 def test_registration_goes_on_where_it_was_interrupted(registered):
     _, _, registration, copy = registered
-    assert torch.equal(registration.offsets[SEQUENCE], copy.offsets[SEQUENCE])
-    assert registration.result[SEQUENCE][0] == copy.result[SEQUENCE][0]
+    assert torch.equal(registration.maps.offsets[SEQUENCE], copy.maps.offsets[SEQUENCE])
+    assert frames_with_map(registration.maps) == frames_with_map(copy.maps)
     assert torch.equal(registration.rest.offsets, copy.rest.offsets)
 
 
@@ -160,15 +167,16 @@ def test_the_network_learns_to_follow_maps_that_lag_behind_the_motion(registered
     model = ModelConfig(channels=(8, 16, 16), window=3, memory=2, heads=2)
     config = dataclasses.replace(config, model=model)
     small = Avatar.from_capture(capture, capture.body, config.atlas, model)
-    trainer = ChunkTrainer(config, capture, small, {SEQUENCE: range(4, LAST + 1)}, None)
-    trainer.registered = registration.result
-    optimizers = make_optimizers(small, RestOffsets(small, []), config.schedule)
+    state = TrainingState.begin(config, capture, small, {SEQUENCE: range(4, LAST + 1)}, [])
+    state.registered = registration.maps
+    signals = {SEQUENCE: small.driving_signal(capture.motions[SEQUENCE])}
+    trainer = ChunkTrainer(config, capture, state, signals, None)
     gradients, losses = Gradients(list(small.parameters())), []
     for step in range(60):
-        set_rates(optimizers, schedule_at(config.schedule, 0.13 + 0.15 * step / 60))
+        set_rates(state.optimizers, schedule_at(config.schedule, 0.13 + 0.15 * step / 60))
         gradients.clear()
         losses.append(trainer.backward_pretraining(np.random.default_rng([1, step])).loss)
-        for optimizer in optimizers.values():
+        for optimizer in state.optimizers.values():
             optimizer.step()
     assert np.mean(losses[-10:]) < 0.5 * np.mean(losses[:10])
 
@@ -186,25 +194,23 @@ def test_a_figure_without_a_garment_is_not_registered():
     config, capture = TrainConfig(), open_capture()
     bare = dataclasses.replace(config.atlas, garment="off")
     avatar = Avatar.from_capture(capture, capture.body, bare, config.model)
-    registration = Registration(config, capture, avatar, RestOffsets(avatar, []), {}, {SEQUENCE: range(9)})
-    assert registration.complete
-    assert registration.reduced(config.schedule).pretraining_fraction == 0
+    maps = RegisteredMaps.begin(config, capture, avatar, {SEQUENCE: range(9)})
+    assert maps.complete
+    assert not maps.clips
+    assert not maps.usable
+    assert without_pretraining(config.schedule).pretraining_fraction == 0
 
 
 class ThreeFrames(Registration):
     """A registration whose frames are fitted at once."""
 
-    complete = property(lambda self: self.count == 3)
-
     def __init__(self):
-        self.budget_used, self.count = 0.125, 0
+        self.maps = RegisteredMaps({SEQUENCE: range(3)}, 1, {SEQUENCE: frozenset()})
+        self.maps.budget_used = 0.125
         self.avatar = SimpleNamespace(unhide_covered_texels=lambda: None)
 
     def fit_next(self):
-        self.count += 1
-
-    def all_gather(self):
-        pass
+        self.maps.count += 1
 
 
 @pytest.mark.parametrize("behind", [0.0, 0.01])
@@ -214,12 +220,12 @@ def test_workers_whose_clocks_differ_agree_on_the_time_that_registration_took(be
 
     class Late(loop.Clock):
         def used(self):
-            return 0.5 + registration.count / 8 - behind
+            return 0.5 + registration.maps.count / 8 - behind
 
     class Shared(Gradients):
         def average(self, stop, used):
-            return stop, 0.5 + registration.count / 8
+            return stop, 0.5 + registration.maps.count / 8
 
     took = loop._register(registration, Shared([]), [], Late(1.0), 0.5, lambda *_: None)
     assert took == (False, 0.875)
-    assert registration.budget_used == 0.125 + 0.375
+    assert registration.maps.budget_used == 0.125 + 0.375

@@ -9,8 +9,7 @@ from dsar.cli import parse
 from dsar.cli.command import file_stem
 from dsar.cli.train import Train
 from dsar.config import PRESETS
-from dsar.training.chunk import UpdateMetrics
-from dsar.training.report import Monitor
+from dsar.training.report import Monitor, UpdateMetrics
 
 
 @pytest.mark.parametrize("preset", PRESETS)

@@ -150,7 +150,7 @@ def test_captures_are_opened_anew_in_other_processes(written, name):
 
 
 def test_without_ranges_two_thirds_train_and_a_gap_is_left(written, original, tmp_path):
-    from dsar.data.captures.takes import GAP, split_take
+    from dsar.data.captures.splits import GAP, split_take
 
     assert split_take(300, None, None) == (range(200), range(200 + GAP, 300))
     assert split_take(300, "0-99", None) == (range(100), range(200 + GAP, 300))

@@ -111,7 +111,7 @@ ABLATIONS = {
     "direct attention": ({"memory": 1, "bank": "features"}, {"bank.attention.position_embedding"}),
     "without velocity": ({"velocity": False}, {"encoder.pyramid.first.weight"}),
     "without acceleration": ({"acceleration": False}, {"encoder.pyramid.first.weight"}),
-    "without lags": ({"mean_time_constants": ()}, {"encoder.pyramid.first.weight"}),
+    "without running means": ({"mean_time_constants": ()}, {"encoder.pyramid.first.weight"}),
     "without motion embedding": ({"motion_embedding": False}, {"motion_embedding."}),
     "mean of rows": ({"readout": "mean"}, set()),
     "bidirectional": ({"readout": "mean", "causal": False}, set()),

@@ -7,7 +7,7 @@ import torch
 from networks import SIZE, SMALL, VARIANTS, WIRINGS, build, inputs, roll
 from reference_variants import ReferenceVariant, VariantRollout, fold_kernels
 
-from dsar.network.reference import ReferenceNetwork, ReferenceRollout, fold_doubling, motion_magnitude
+from dsar.network.reference import ReferenceNetwork, ReferenceRollout, fold_doubling
 from dsar.network.session import InferenceSession
 
 PAPER = dataclasses.replace(SMALL, wiring="shared", channels=(4, 8, 8))
@@ -69,7 +69,7 @@ def test_gradients_are_those_of_the_papers_equations():
 def test_motion_magnitude_is_the_length_of_the_velocity():
     velocity = torch.zeros(2, 3, 4, 5)
     velocity[1, :, 2, 3] = torch.tensor([2.0, 3.0, 6.0])
-    magnitude = motion_magnitude(velocity)
+    magnitude = ReferenceNetwork.motion_magnitude(velocity)
     assert magnitude.shape == (2, 1, 4, 5)
     assert magnitude[1, 0, 2, 3] == 7
     assert magnitude.sum() == 7
@@ -77,7 +77,7 @@ def test_motion_magnitude_is_the_length_of_the_velocity():
 
 @pytest.mark.parametrize("wiring", WIRINGS)
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_what_is_saved_changes_nothing(wiring, variant):
+def test_caching_changes_nothing(wiring, variant):
     """In all variants the reference, training and a session agree, beyond the window and the bank."""
     config = dataclasses.replace(SMALL, wiring=wiring, **VARIANTS[variant])
     network = build(config).double()

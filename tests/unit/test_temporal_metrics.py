@@ -6,9 +6,9 @@ from functools import partial
 import pytest
 import torch
 
-from dsar.evaluation.heldout import compare_change
 from dsar.evaluation.image_metrics import flip
 from dsar.evaluation.temporal_metrics import temporal_psnr, trace_back, warp_error
+from dsar.evaluation.view_metrics import compare_change
 from dsar.evaluation.views import View
 from dsar.geometry.cameras import project
 from dsar.raster import rasterize

@@ -2,7 +2,6 @@
 
 import io
 import json
-import os
 import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -16,6 +15,7 @@ from PIL import Image
 
 from capture.choreography import OneToMany, Take
 from capture.garment import COLUMNS, ROWS, grid_faces
+from dsar.atomic_files import atomic_write, write_text_atomically
 from dsar.data.motions.files import write_motion
 from dsar.types import Body, Camera
 
@@ -61,9 +61,7 @@ def write_capture(
         "sequences": {name: _describe_take(name, take) for name, take in takes.items()},
         "one_to_many": [asdict(pair) for pair in pairs],
     }
-    temporary = out / ".capture.json.tmp"
-    temporary.write_text(json.dumps(record, indent=1) + "\n")
-    os.replace(temporary, out / "capture.json")
+    write_text_atomically(out / "capture.json", json.dumps(record, indent=1) + "\n")
 
 
 def _describe_camera(camera: Camera) -> dict[str, object]:
@@ -91,8 +89,7 @@ def _zip_images(path: Path, folder: Path, cameras: Sequence[Camera], frames: int
     """Write the images of one sequence as an archive, unless it is there."""
     if path.exists():
         return
-    temporary = path.with_suffix(".tmp")
-    with zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
+    with atomic_write(path) as draft, zipfile.ZipFile(draft, "w", zipfile.ZIP_STORED) as archive:
         for camera in cameras:
             for frame in range(frames):
                 entry = f"{camera.name}/{frame:04d}"
@@ -100,7 +97,6 @@ def _zip_images(path: Path, folder: Path, cameras: Sequence[Camera], frames: int
                     data = _encode_webp(np.asarray(image))
                 # A fixed date keeps the archive's bytes reproducible.
                 archive.writestr(zipfile.ZipInfo(f"{entry}.webp", (2026, 1, 1, 0, 0, 0)), data)
-    os.replace(temporary, path)
 
 
 def _encode_webp(image: UInt8[ndarray, "h w 4"]) -> bytes:
@@ -129,9 +125,8 @@ def _write_garment(path: Path, runs: list[Path]) -> None:
     arrays: dict[str, Any] = {f"run{k}": _encode(np.load(run)) for k, run in enumerate(runs)}
     arrays["faces"] = grid_faces(ROWS // DECIMATION, COLUMNS // DECIMATION)
     arrays["unit"] = np.float64(GARMENT_UNIT)
-    temporary = path.with_suffix(".tmp.npz")
-    np.savez_compressed(temporary, **arrays)
-    os.replace(temporary, path)
+    with atomic_write(path) as draft, draft.open("wb") as file:
+        np.savez_compressed(file, **arrays)
 
 
 def _encode(cloth: Float[ndarray, "f n 3"]) -> Int[ndarray, "f v 3"]:

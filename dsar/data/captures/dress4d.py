@@ -27,7 +27,7 @@ from dsar.body.model import FACE_JOINTS, JOINT_NAMES
 from dsar.data.captures.calibration import opencv_camera
 from dsar.data.captures.multiview import MultiViewCapture
 from dsar.data.captures.scans import PhotosAndScans, Scans, virtual_cameras
-from dsar.data.captures.takes import OpenOptions, Take, apply_orientation, make_capture, rotate_camera_world
+from dsar.data.captures.takes import OpenOptions, Take, make_capture, rotate_camera_world, rotation_to_upright
 from dsar.data.folders import check_name, list_folder, list_images
 from dsar.data.images.conversions import ConversionLog
 from dsar.data.images.decoding import image_size
@@ -91,11 +91,11 @@ def open_4d_dress(root: Path, options: OpenOptions) -> MultiViewCapture:
     fits = [_read_fits(folder, scan.frames, hands) for folder, scan in zip(folders, scans, strict=True)]
     virtual = []
     if all(scan.complete for scan in scans):
-        turn = apply_orientation(str(root), [motion for motion, _ in fits])
+        R_world_file = rotation_to_upright(str(root), [motion for motion, _ in fits])
         ring = virtual_cameras(
-            [rotate_camera_world(c, turn) for c in released], turn.numpy() @ scans[0].center
+            [rotate_camera_world(c, R_world_file) for c in released], R_world_file.numpy() @ scans[0].center
         )
-        virtual = [rotate_camera_world(camera, turn.T) for camera in ring]
+        virtual = [rotate_camera_world(camera, R_world_file.T) for camera in ring]
     takes, conversions = [], ConversionLog(f"{root.parent.name}_{root.name}")
     for folder, scan, (motion, _) in zip(folders, scans, fits, strict=True):
         photos = Photos(

@@ -90,7 +90,7 @@ class MultiViewCapture:
     """Which frame of its images is a sequence's first, where that is not 0."""
     backdrop: bool = False
     """Whether images are photographs, with colours outside the masks, and kept once they were decoded."""
-    turn: Float[Tensor, "3 3"] = field(default_factory=lambda: torch.eye(3))
+    R_world_file: Float[Tensor, "3 3"] = field(default_factory=lambda: torch.eye(3))
     """Rotation from the world of the capture's files to ours, in which Y is up."""
 
     def __reduce__(self) -> tuple[Callable[..., "MultiViewCapture"], tuple]:

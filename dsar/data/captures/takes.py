@@ -13,18 +13,15 @@ from torch import Tensor
 
 from dsar.body.files import choose_body, load_body
 from dsar.data.captures.multiview import MultiViewCapture, Views
+from dsar.data.captures.splits import split_takes
 from dsar.data.motions.files import rotate_motion
 from dsar.data.motions.mmd import label_sequences
 from dsar.data.motions.up_axis import rotation_to_y_up
 from dsar.errors import CaptureError
 from dsar.geometry.camera_checks import check_names_differ
-from dsar.geometry.frame_numbers import parse_frame_range
 from dsar.geometry.rotations import matrix_from_axis_angle
 from dsar.types import Body, Camera, Motion
 
-GAP = 40
-"""Frames of a take that are left out between training and test: as many as any of our networks remembers
-(the paper's longest window and memory), so that all are tested on the same ones."""
 _UPRIGHT = 0.7
 LOGGER = logging.getLogger(__name__)
 
@@ -94,17 +91,20 @@ def make_capture(
     """
     check_names_differ(f"capture {root}", [camera.name for camera in cameras], CaptureError)
     body, path = fitted_body(str(root), options.body, betas, gender)
-    turn = apply_orientation(str(root), [take.motion for take in takes])
-    cameras = [rotate_camera_world(camera, turn) for camera in cameras]
+    R_world_file = rotation_to_upright(str(root), [take.motion for take in takes])
+    cameras = [rotate_camera_world(camera, R_world_file) for camera in cameras]
     for take in takes:
         _count_images(f"capture {root}, {take.motion.name}", cameras, take)
         take.views.check_samples(cameras)
-    parts, splits = _split(str(root), takes, options)
+    by_name = {take.motion.name: take for take in takes}
+    lengths = {name: len(take.motion) for name, take in by_name.items()}
+    sequences = split_takes(f"capture {root}", lengths, options.train_frames, options.test_frames)
+    splits = {split: tuple(members) for split, members in sequences.items()}
     motions, starts, views = {}, {}, {}
-    for key, (take, frames) in parts.items():
-        motion = rotate_motion(take.motion.slice(frames.start, frames.stop), body, turn)
-        motions[key] = dataclasses.replace(motion, name=key)
-        starts[key], views[key] = frames.start, take.views
+    for key, (take, frames) in (sequences["train"] | sequences["test"]).items():
+        motion = by_name[take].motion.slice(frames.start, frames.stop)
+        motions[key] = dataclasses.replace(rotate_motion(motion, body, R_world_file), name=key)
+        starts[key], views[key] = frames.start, by_name[take].views
     return MultiViewCapture(
         root=root,
         name=name,
@@ -117,7 +117,7 @@ def make_capture(
         splits=splits | label_sequences(motions, splits),
         views=views,
         starts=starts,
-        turn=turn,
+        R_world_file=R_world_file,
         backdrop=True,
         reopen=reopen,
     )
@@ -139,51 +139,8 @@ def fitted_body(
     return load_body(found, betas), found
 
 
-def _split(
-    name: str, takes: Sequence[Take], options: OpenOptions
-) -> tuple[dict[str, tuple[Take, range]], dict[str, tuple[str, ...]]]:
-    """Return sequences by name, and the names of those that train and that test."""
-    ranges_given = {"train": options.train_frames, "test": options.test_frames}
-    if len(takes) == 1:
-        ranges = zip(ranges_given, split_take(len(takes[0].motion), *ranges_given.values()), strict=True)
-        groups = {split: {f"{takes[0].motion.name}_{split}": (takes[0], frames)} for split, frames in ranges}
-    else:
-        held = max(1, len(takes) // 3)
-        groups = {
-            split: {
-                take.motion.name: (take, parse_frame_range(ranges_given[split], len(take.motion)))
-                for take in some
-            }
-            for split, some in (("train", takes[:-held]), ("test", takes[-held:]))
-        }
-    groups = {
-        split: {key: part for key, part in parts.items() if len(part[1])} for split, parts in groups.items()
-    }
-    for split, parts in groups.items():
-        if not parts:
-            raise CaptureError(
-                f"capture {name}: no frames are left to {split} with; its takes have "
-                f"{', '.join(str(len(take.motion)) for take in takes)} frames, and a single one is cut "
-                f"with a gap of {GAP}; say which with --train-frames and --test-frames"
-            )
-    return groups["train"] | groups["test"], {split: tuple(parts) for split, parts in groups.items()}
-
-
-def split_take(count: int, train: str | None, test: str | None) -> tuple[range, range]:
-    """Return which frames of a take train and which test."""
-    third = count - count // 3
-    training = parse_frame_range(train, count) if train else range(third)
-    testing = parse_frame_range(test, count) if test else range(max(third, training.stop) + GAP, count)
-    if training.start < testing.stop and testing.start < training.stop + GAP:
-        LOGGER.warning(
-            "Frames %d-%d train and %d-%d test: a memory reaches from one to the other (gap of %d asked)",
-            *(training.start, training.stop - 1, testing.start, testing.stop - 1, GAP),
-        )
-    return training, testing
-
-
-def apply_orientation(name: str, motions: Sequence[Motion]) -> Float[Tensor, "3 3"]:
-    """Return the rotation by quarter turns that puts +Y where the bodies' heads mostly are."""
+def rotation_to_upright(name: str, motions: Sequence[Motion]) -> Float[Tensor, "3 3"]:
+    """Return R_world_file, by quarter turns, that puts +Y where the bodies' heads mostly are."""
     roots = torch.cat([matrix_from_axis_angle(motion.rotations[:, 0]) for motion in motions])
     up = roots[:, :, 1].mean(0)
     axis = int(up.abs().argmax())
@@ -195,10 +152,10 @@ def apply_orientation(name: str, motions: Sequence[Motion]) -> Float[Tensor, "3 
     return rotation_to_y_up(("-" if up[axis] < 0 else "") + "xyz"[axis])
 
 
-def rotate_camera_world(camera: Camera, turn: Float[Tensor, "3 3"]) -> Camera:
-    """Return the same camera in a world that was turned."""
+def rotate_camera_world(camera: Camera, R_world_file: Float[Tensor, "3 3"]) -> Camera:
+    """Return the same camera in a rotated world."""
     transform = camera.T_camera_world.clone()
-    transform[:3, :3] = transform[:3, :3] @ turn.T
+    transform[:3, :3] = transform[:3, :3] @ R_world_file.T
     return dataclasses.replace(camera, T_camera_world=transform)
 
 

@@ -52,7 +52,7 @@ def find_gross_faults(
     """Return what body and masks say of cameras, motion and numbering."""
     inside = statistics.fmean(each.inside for each in agreements)
     before = np.array([each.error for each in agreements])
-    candidate = find_fault(hypothesis, masks, coarse_faults(capture.turn), before)
+    candidate = find_fault(hypothesis, masks, coarse_faults(capture.R_world_file), before)
     apart = inside < APART
     # A body that is drawn too small lies in the mask, and is as wrong as one beside it.
     gross = (

@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 from dsar.atomic_files import atomic_write
 from dsar.errors import MissingDependencyError
+from dsar.evaluation.study.summary import RowSummary, TableSummary
 
 PAPER = {
     "HumanNeRF": (0.18, 20.0567, 0.1292),
@@ -47,34 +48,45 @@ class Point:
     """By quality: half of what its seeds part by; of models with several."""
 
 
-def chart_points(summary: Mapping[str, Any]) -> list[Point]:
+def chart_points(summary: Mapping[str, TableSummary]) -> list[Point]:
     """Return the models of a study's summary that were measured whole and trained as long, each once."""
-    found: dict[str, Point] = {}
-    for row in _rows(summary):
-        mean = row["mean"]
+    points: dict[str, Point] = {}
+    for row in _measured_rows(summary):
         if _TIME not in row["settings"]:
-            values = (1000 / mean["fps"], mean["psnr_box"], mean["lpips"], mean["gaussians"])
-            spread = {key: row["spread"][key] / 2 for key in QUALITIES if row["spread"][key] is not None}
-            point = Point(row["label"], *values, mean["passed"], spread)
-            found.setdefault(_key(row["settings"]), point)
-    return list(found.values())
+            point = Point(
+                row["label"],
+                ms=1000 / _mean(row, "fps"),
+                psnr_box=_mean(row, "psnr_box"),
+                lpips=row["mean"]["lpips"],
+                gaussians=_mean(row, "gaussians"),
+                passed=row["mean"]["passed"],
+                spread={key: spread / 2 for key in QUALITIES if (spread := row["spread"][key]) is not None},
+            )
+            points.setdefault(_key(row["settings"]), point)
+    return list(points.values())
 
 
-def training_time_series(summary: Mapping[str, Any]) -> dict[str, list[tuple[float, float]]]:
+def training_time_series(summary: Mapping[str, TableSummary]) -> dict[str, list[tuple[float, float]]]:
     """Return minutes of training and PSNR in the box of each model that was trained for several times."""
-    found: dict[str, dict[float, float]] = {}
+    series: dict[str, dict[float, float]] = {}
     labels: dict[str, str] = {}
-    for row in _rows(summary):
-        rest = {key: value for key, value in row["settings"].items() if key != _TIME}
-        found.setdefault(_key(rest), {})[row["mean"]["minutes"]] = row["mean"]["psnr_box"]
-        labels.setdefault(_key(rest), row["label"])
-    return {labels[key]: sorted(times.items()) for key, times in found.items() if len(times) > 1}
+    for row in _measured_rows(summary):
+        model = _key({key: value for key, value in row["settings"].items() if key != _TIME})
+        series.setdefault(model, {})[_mean(row, "minutes")] = _mean(row, "psnr_box")
+        labels.setdefault(model, row["label"])
+    return {labels[key]: sorted(times.items()) for key, times in series.items() if len(times) > 1}
 
 
-def _rows(summary: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+def _measured_rows(summary: Mapping[str, TableSummary]) -> list[RowSummary]:
     # Figures of another split are of other frames.
     rows = [row for table in summary.values() if table["split"] == _SPLIT for row in table["rows"]]
     return [row for row in rows if not row["zeroed"] and row["mean"]["fps"]]
+
+
+def _mean(row: RowSummary, column: str) -> float:
+    value = row["mean"][column]
+    assert value is not None, "every run that was measured has it"
+    return value
 
 
 def _key(settings: Mapping[str, Any]) -> str:

@@ -153,7 +153,7 @@ class Study:
         run = self._run(model)
         if run.exists:
             self._check(run.folder, read_json(run.config), model)
-        return run.exists and read_progress(run)["progress"] >= 1
+        return run.exists and read_progress(run).progress >= 1
 
     def _check(self, path: Path, settings: Any, model: Model) -> None:
         if isinstance(settings, dict) and isinstance(settings.get("capture"), str):
@@ -181,7 +181,10 @@ class Study:
         # The battery needs no more than one core and is over when `evaluate` comes to measure times.
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as other:
             battery = None if each.zeroed else other.submit(_stress, run.folder, self.cases)
-            found |= {"updates": read_progress(run)["step"], **evaluate(avatar, capture, streams=streams)}
+            found |= {
+                "updates": read_progress(run).step,
+                **evaluate(avatar, capture, streams=streams).to_json(),
+            }
             if battery is not None:
                 found["stress"] = battery.result()
         write_text_atomically(self._figures(each), json.dumps(found, indent=1) + "\n")

@@ -2,7 +2,7 @@
 
 import statistics
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, TypedDict
 
 from dsar.evaluation.study.runner import Study
 from dsar.evaluation.study.tables import Row, Table
@@ -21,7 +21,33 @@ _DIGITS = {
 }
 
 
-def summarize_tables(study: Study, tables: Mapping[str, Table]) -> dict[str, Any]:
+class RowSummary(TypedDict):
+    """A row of a table, as study.json keeps it."""
+
+    label: str
+    settings: dict[str, Any]
+    """Settings that differ from the preset's."""
+    zeroed: list[str]
+    """Streams that are taken away when the model is measured."""
+    seeds: list[int]
+    """Of the runs that were measured."""
+    mean: dict[str, float | None]
+    """By column: over the runs that have a figure; None where none has."""
+    spread: dict[str, float | None]
+    """By column: the largest difference of two runs; None of fewer than two."""
+    paper: dict[str, float]
+    """The paper's figures by column."""
+
+
+class TableSummary(TypedDict):
+    """A table, as study.json keeps it."""
+
+    title: str
+    split: str
+    rows: list[RowSummary]
+
+
+def summarize_tables(study: Study, tables: Mapping[str, Table]) -> dict[str, TableSummary]:
     """Return each table: its rows, with means over seeds, how far seeds part, and the paper's figures."""
     return {
         name: {
@@ -33,21 +59,21 @@ def summarize_tables(study: Study, tables: Mapping[str, Table]) -> dict[str, Any
     }
 
 
-def _summarize(row: Row, found: Sequence[Mapping[str, Any]], split: str) -> dict[str, Any]:
-    seen = [_numbers(figures, split) for figures in found]
-    values = {key: [v for each in seen if (v := each[key]) is not None] for key in _COLUMNS}
+def _summarize(row: Row, runs: Sequence[Mapping[str, Any]], split: str) -> RowSummary:
+    columns = [_columns_of(figures, split) for figures in runs]
+    values = {key: [v for run in columns if (v := run[key]) is not None] for key in _COLUMNS}
     return {
         "label": row.label,
         "settings": dict(row.settings),
         "zeroed": list(row.zeroed),
-        "seeds": [figures["seed"] for figures in found],
+        "seeds": [figures["seed"] for figures in runs],
         "mean": {key: statistics.fmean(v) if v else None for key, v in values.items()},
         "spread": {key: max(v) - min(v) if len(v) > 1 else None for key, v in values.items()},
         "paper": dict(row.paper),
     }
 
 
-def _numbers(figures: Mapping[str, Any], split: str) -> dict[str, float | None]:
+def _columns_of(figures: Mapping[str, Any], split: str) -> dict[str, float | None]:
     """Return a model's columns; those that were not measured are null."""
     # A capture that labels no sequence as far has its test split judged in its place.
     images = figures["splits"].get(split) or figures["splits"]["test"]
@@ -62,7 +88,7 @@ def _numbers(figures: Mapping[str, Any], split: str) -> dict[str, float | None]:
     }
 
 
-def to_markdown(summary: Mapping[str, Any]) -> str:
+def to_markdown(summary: Mapping[str, TableSummary]) -> str:
     """Return the tables as Markdown: ours with the spread over seeds, and the paper's beside them."""
     parts = []
     for table in summary.values():
@@ -72,7 +98,7 @@ def to_markdown(summary: Mapping[str, Any]) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def table_cells(table: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
+def table_cells(table: TableSummary) -> tuple[list[str], list[list[str]]]:
     """Return a table's head and rows as text; the paper's figures stand in the last columns."""
     paper = [key for key in _IMAGE if any(key in row["paper"] for row in table["rows"])]
     head, rows = ["", "seeds", *_COLUMNS, *(f"paper {key}" for key in paper)], []

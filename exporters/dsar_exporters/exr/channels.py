@@ -39,19 +39,19 @@ def data_channels(picture: Picture, layers: Collection[str]) -> Channels:
         if picture.output.first_hit_depth is not None:
             channels["front.Z"] = _array(picture.output.first_hit_depth)
     if "N" in layers:
-        channels |= _split("N", "XYZ", _found("N", aovs.normals))
+        channels |= _split("N", "XYZ", _required("N", aovs.normals))
     if "P" in layers:
-        channels |= _split("P", "XYZ", _found("P", aovs.positions))
+        channels |= _split("P", "XYZ", _required("P", aovs.positions))
     if "motion" in layers:
         # Compositors count pixels upwards.
         upwards = torch.tensor([1.0, -1.0])
-        channels |= _split("forward", "uv", _found("motion", aovs.forward) * upwards)
-        channels |= _split("backward", "uv", _found("motion", aovs.backward) * upwards)
+        channels |= _split("forward", "uv", _required("motion", aovs.forward) * upwards)
+        channels |= _split("backward", "uv", _required("motion", aovs.backward) * upwards)
     if "id" in layers:
-        ids = _found("id", picture.output.largest_weight_id).numpy()
+        ids = _required("id", picture.output.largest_weight_id).numpy()
         channels["id"] = np.where(ids < 0, NO_GAUSSIAN, ids.astype(np.uint32))
     if "crypto" in layers:
-        _require_any("crypto", bool(aovs.coverage))
+        _require("crypto", bool(aovs.coverage))
         channels |= matte_channels(aovs.coverage)
     return channels
 
@@ -66,15 +66,15 @@ def _split(layer: str, names: str, values: Tensor) -> Channels:
     return {f"{layer}.{name}": _array(values[..., index]) for index, name in enumerate(names)}
 
 
-def _found(layer: str, values: Tensor | None) -> Tensor:
-    """Return an output variable that has to be there."""
-    _require_any(layer, values is not None)
+def _required(layer: str, values: Tensor | None) -> Tensor:
+    """Return an output variable that the picture must have."""
+    _require(layer, values is not None)
     assert values is not None
     return values
 
 
-def _require_any(layer: str, there: bool) -> None:
-    if not there:
+def _require(layer: str, present: bool) -> None:
+    if not present:
         raise ExportError(
             f"EXR: expected a picture with {layer}, found one without: render it with --aov {layer}"
         )

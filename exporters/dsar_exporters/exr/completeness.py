@@ -24,19 +24,19 @@ def is_complete(path: Path) -> bool:
     """
     with path.open("rb") as file:
         try:
-            return _end(file) == path.stat().st_size
+            return _expected_size(file) == path.stat().st_size
         except (struct.error, KeyError):
             return False
 
 
-def _end(file: BinaryIO) -> int:
+def _expected_size(file: BinaryIO) -> int:
     """Return the size that a file should have, by its chunk that lies last."""
     _, version = _unpack(file, "<2i")
     multipart = bool(version & _MULTIPART)
-    headers = [_header(file)]
+    headers = [_read_header(file)]
     while multipart and headers[-1]:
-        headers.append(_header(file))
-    counts = [_chunks(header) for header in headers if header]
+        headers.append(_read_header(file))
+    counts = [_chunk_count(header) for header in headers if header]
     offset, part = max(
         (offset, part) for part, count in enumerate(counts) for offset in _unpack(file, f"<{count}Q")
     )
@@ -46,16 +46,16 @@ def _end(file: BinaryIO) -> int:
     return _unpack(file, "<i")[0] + file.tell()
 
 
-def _header(file: BinaryIO) -> dict[str, bytes]:
+def _read_header(file: BinaryIO) -> dict[str, bytes]:
     """Return the attributes of a part; none behind the last part."""
-    found = {}
-    while name := _text(file):
-        _text(file)
-        found[name] = file.read(_unpack(file, "<i")[0])
-    return found
+    attributes = {}
+    while name := _read_text(file):
+        _read_text(file)
+        attributes[name] = file.read(_unpack(file, "<i")[0])
+    return attributes
 
 
-def _chunks(header: Mapping[str, bytes]) -> int:
+def _chunk_count(header: Mapping[str, bytes]) -> int:
     """Return into how many chunks a part's rows are packed."""
     if "chunkCount" in header:
         return struct.unpack("<i", header["chunkCount"])[0]
@@ -63,15 +63,15 @@ def _chunks(header: Mapping[str, bytes]) -> int:
     return -(-(last - first + 1) // _LINES_OF_CHUNK[header["compression"][0]])
 
 
-def _text(file: BinaryIO) -> str:
+def _read_text(file: BinaryIO) -> str:
     """Return what stands before the next null."""
-    found = bytearray()
+    text = bytearray()
     while (byte := file.read(1)) not in (b"\0", b""):
-        found += byte
+        text += byte
     if not byte:
         raise struct.error("the file ends within its header")
-    return found.decode("latin1")
+    return text.decode("latin1")
 
 
-def _unpack(file: BinaryIO, layout: str) -> tuple[int, ...]:
-    return struct.unpack(layout, file.read(struct.calcsize(layout)))
+def _unpack(file: BinaryIO, struct_format: str) -> tuple[int, ...]:
+    return struct.unpack(struct_format, file.read(struct.calcsize(struct_format)))

@@ -41,8 +41,8 @@ def matte_channels(coverage: Mapping[str, Tensor]) -> dict[str, Float32[np.ndarr
     # Stable, so that equal shares have one order everywhere.
     order = np.argsort(-stack, axis=-1, kind="stable")[..., :_RANKS]
     ranked = np.take_along_axis(stack, order, -1)
-    kept, total = ranked.sum(-1, keepdims=True), stack.sum(-1, keepdims=True)
-    ranked = ranked * (total / kept)
+    ranked_total, total = ranked.sum(-1, keepdims=True), stack.sum(-1, keepdims=True)
+    ranked = ranked * (total / ranked_total)
     named = np.where(ranked > 0, ids[order], np.float32(0))
     image = np.zeros((*hit.shape, _RANKS, 2), np.float32)
     image[hit, : ranked.shape[-1]] = np.stack([named, ranked], -1)

@@ -29,13 +29,13 @@ def deep_channels(
     counts = samples.counts.numpy().ravel()
     pixels = np.repeat(np.arange(len(counts)), counts)
     alphas = samples.alphas.numpy()
-    shares = alphas * _transmittance(alphas, counts)
+    weights = alphas * _transmittance(alphas, counts)
     colors = target.from_display(samples.colors.numpy())
-    light = np.stack([np.bincount(pixels, shares * colors[:, c], len(counts)) for c in range(3)], -1)
+    light = np.stack([np.bincount(pixels, weights * colors[:, c], len(counts)) for c in range(3)], -1)
     # Of no samples at all NumPy counts integers.
     light = light.astype(np.float64)
-    wanted = flat.reshape(-1, 3)
-    factors = np.divide(wanted, light, out=np.zeros_like(light), where=np.abs(light) > _MIN_LIGHT)
+    target_light = flat.reshape(-1, 3)
+    factors = np.divide(target_light, light, out=np.zeros_like(light), where=np.abs(light) > _MIN_LIGHT)
     shaded = (colors * factors[pixels] * alphas[:, None]).astype(np.float32)
     flat_channels = {
         **{name: np.ascontiguousarray(shaded[:, index]) for index, name in enumerate("RGB")},
@@ -50,8 +50,8 @@ def deep_channels(
 
 def _transmittance(alphas: Float[np.ndarray, " m"], counts: np.ndarray) -> Float[np.ndarray, " m"]:
     """Return what all samples in front of each one in its pixel let through."""
-    through = np.log1p(-alphas.astype(np.float64))
-    total = np.cumsum(through) - through
+    log_transmittance = np.log1p(-alphas.astype(np.float64))
+    total = np.cumsum(log_transmittance) - log_transmittance
     hit = np.flatnonzero(counts)
     starts = (np.cumsum(counts) - counts)[hit]
     return np.exp(total - np.repeat(total[starts], counts[hit]))
@@ -59,13 +59,13 @@ def _transmittance(alphas: Float[np.ndarray, " m"], counts: np.ndarray) -> Float
 
 def _ragged(values: np.ndarray, pixels: np.ndarray, starts: np.ndarray, counts: np.ndarray) -> np.ndarray:
     """Return an array of each pixel's values, None where there are none."""
-    found = np.empty(pixels.size, object)
+    ragged = np.empty(pixels.size, object)
     # Where all are None a channel has no type.
-    found[0] = values[:0]
-    pixels_there = pixels.ravel()
-    hit = np.flatnonzero(counts[pixels_there])
-    first = starts[pixels_there[hit]]
-    last = first + counts[pixels_there[hit]]
-    for place, start, end in zip(hit.tolist(), first.tolist(), last.tolist(), strict=True):
-        found[place] = values[start:end]
-    return found.reshape(pixels.shape)
+    ragged[0] = values[:0]
+    flat_pixels = pixels.ravel()
+    hit = np.flatnonzero(counts[flat_pixels])
+    first = starts[flat_pixels[hit]]
+    last = first + counts[flat_pixels[hit]]
+    for index, start, end in zip(hit.tolist(), first.tolist(), last.tolist(), strict=True):
+        ragged[index] = values[start:end]
+    return ragged.reshape(pixels.shape)

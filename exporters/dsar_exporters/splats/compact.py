@@ -32,9 +32,9 @@ class CompressedPlySequence(SplatSequence):
 
     def write_frame(self, draft: Path, gaussians: Gaussians, sequence: GaussianSequence, frame: int) -> None:
         """Write one frame."""
-        made = draft.with_name("draft.compressed.ply")
-        _require_gsply("compressed PLY").plywrite(made, _data(gaussians), compressed=True)
-        made.replace(draft)
+        written = draft.with_name("draft.compressed.ply")
+        _require_gsply("compressed PLY").plywrite(written, _data(gaussians), compressed=True)
+        written.replace(draft)
 
     def estimated_bytes(self, first: Gaussians, frames: int) -> int:
         """Return how large the files will be; see `Output`."""
@@ -46,7 +46,7 @@ class CompressedPlySequence(SplatSequence):
 class SpzSequence(SplatSequence):
     """SPZ version 3, which all its readers know: positions to 0.24 mm, standard deviations to 3 %.
 
-    Its own axes are x right, y up, z back, as ours and glTF's are, so that nothing is turned. Gaussians keep
+    Its own axes are x right, y up, z back, as ours and glTF's are, so that no axis changes. Gaussians keep
     their order.
     """
 

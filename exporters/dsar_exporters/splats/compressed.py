@@ -45,9 +45,9 @@ def unpack(elements: Mapping[str, np.ndarray], where: str) -> Encoded:
     """
     chunks, packed = elements[CHUNK], elements.get(VERTEX, np.zeros(0))
     names = {CHUNK: chunks.dtype.names or (), VERTEX: packed.dtype.names or ()}
-    wanted = {CHUNK: [name for bounds in _BOUNDS.values() for side in bounds for name in side]}
-    wanted[VERTEX] = list(_PACKED)
-    for element, fields in wanted.items():
+    required = {CHUNK: [name for bounds in _BOUNDS.values() for side in bounds for name in side]}
+    required[VERTEX] = list(_PACKED)
+    for element, fields in required.items():
         if missing := [field for field in fields if field not in names[element]]:
             raise ExportError(
                 f"{where}: expected a compressed PLY, found no properties {', '.join(missing)} in its "
@@ -59,18 +59,24 @@ def unpack(elements: Mapping[str, np.ndarray], where: str) -> Encoded:
             f"{-(-len(packed) // _SIZE)} chunks, found {len(chunks)}"
         )
     words = {name: packed[name].astype(np.uint32) for name in _PACKED}
-    color, opacity = np.split(_shares(words["packed_color"], _BYTES), [3], 1)
+    color, opacity = np.split(_fractions(words["packed_color"], _BYTES), [3], 1)
     if _has_color_bounds(chunks):
-        color = _within(color, chunks, *_COLOR_BOUNDS)
+        color = _denormalize(color, chunks, *_COLOR_BOUNDS)
     with np.errstate(divide="ignore"):
         logits = np.log(opacity) - np.log1p(-opacity)
     dc = ((color - 0.5) / C0)[:, None]
     return Encoded(
-        means=_single(_within(_shares(words["packed_position"], _MIXED_BITS), chunks, *_BOUNDS["position"])),
-        log_scales=_single(_within(_shares(words["packed_scale"], _MIXED_BITS), chunks, *_BOUNDS["scale"])),
-        rotations=_single(_quaternions(words["packed_rotation"])),
-        logits=_single(logits.clip(-_OPAQUE, _OPAQUE)[:, 0]),
-        harmonics=_single(np.concatenate([dc, _higher(elements.get(HARMONICS), len(packed), where)], 1)),
+        means=_as_float32(
+            _denormalize(_fractions(words["packed_position"], _MIXED_BITS), chunks, *_BOUNDS["position"])
+        ),
+        log_scales=_as_float32(
+            _denormalize(_fractions(words["packed_scale"], _MIXED_BITS), chunks, *_BOUNDS["scale"])
+        ),
+        rotations=_as_float32(_quaternions(words["packed_rotation"])),
+        logits=_as_float32(logits.clip(-_OPAQUE, _OPAQUE)[:, 0]),
+        harmonics=_as_float32(
+            np.concatenate([dc, _unpack_harmonics(elements.get(HARMONICS), len(packed), where)], 1)
+        ),
     )
 
 
@@ -93,35 +99,37 @@ def _has_color_bounds(chunks: np.ndarray) -> bool:
     return all(name in (chunks.dtype.names or ()) for side in _COLOR_BOUNDS for name in side)
 
 
-def _shares(words: UInt32[np.ndarray, " n"], bits: tuple[tuple[int, int], ...]) -> Float64[np.ndarray, "n c"]:
-    """Return the numbers in words, each as a share of its greatest."""
+def _fractions(
+    words: UInt32[np.ndarray, " n"], bits: tuple[tuple[int, int], ...]
+) -> Float64[np.ndarray, "n c"]:
+    """Return the numbers in words, each as a fraction of its greatest."""
     return np.stack([(words >> shift & ((1 << width) - 1)) / ((1 << width) - 1) for shift, width in bits], 1)
 
 
-def _within(
-    shares: Float64[np.ndarray, "n 3"], chunks: np.ndarray, low: tuple[str, ...], high: tuple[str, ...]
+def _denormalize(
+    fractions: Float64[np.ndarray, "n 3"], chunks: np.ndarray, low: tuple[str, ...], high: tuple[str, ...]
 ) -> Float64[np.ndarray, "n 3"]:
-    """Return values that are shares of the way between the bounds of their chunks."""
-    own = np.arange(len(shares)) // _SIZE
+    """Return values that are fractions of the way between the bounds of their chunks."""
+    chunk_of = np.arange(len(fractions)) // _SIZE
     lows, highs = (
-        np.stack([chunks[name].astype(np.float64)[own] for name in side], 1) for side in (low, high)
+        np.stack([chunks[name].astype(np.float64)[chunk_of] for name in side], 1) for side in (low, high)
     )
     with np.errstate(invalid="ignore"):  # infinite bounds: `chunk_faults` names them
-        return lows + shares * (highs - lows)
+        return lows + fractions * (highs - lows)
 
 
 def _quaternions(words: UInt32[np.ndarray, " n"]) -> Float64[np.ndarray, "n 4"]:
     """Return quaternions wxyz: of three parts, and the largest that makes their length 1."""
-    others = (_shares(words, _QUATERNION_BITS) - 0.5) * np.sqrt(2)
+    others = (_fractions(words, _QUATERNION_BITS) - 0.5) * np.sqrt(2)
     largest = np.sqrt(np.maximum(1 - (others**2).sum(1), 0))
-    place = (words >> 30)[:, None]
+    position = (words >> 30)[:, None]
     parts = np.arange(4)
-    # Below the largest's place stand the parts of their own number, above it those of one less.
-    source = np.clip(parts - (parts > place), 0, 2)
-    return np.where(parts == place, largest[:, None], np.take_along_axis(others, source, 1))
+    # Below the largest's position stand the parts of their own number, above it those of one less.
+    source = np.clip(parts - (parts > position), 0, 2)
+    return np.where(parts == position, largest[:, None], np.take_along_axis(others, source, 1))
 
 
-def _higher(records: np.ndarray | None, count: int, where: str) -> Float64[np.ndarray, "n k 3"]:
+def _unpack_harmonics(records: np.ndarray | None, count: int, where: str) -> Float64[np.ndarray, "n k 3"]:
     """Return the harmonics above the constant."""
     if records is None or not records.dtype.names:
         return np.zeros((count, 0, 3))
@@ -135,5 +143,5 @@ def _higher(records: np.ndarray | None, count: int, where: str) -> Float64[np.nd
     return ((bytes_ - 127.5) / 32).reshape(count, 3, -1).transpose(0, 2, 1)
 
 
-def _single(values: np.ndarray) -> Float32[np.ndarray, "..."]:
+def _as_float32(values: np.ndarray) -> Float32[np.ndarray, "..."]:
     return np.ascontiguousarray(values, np.float32)

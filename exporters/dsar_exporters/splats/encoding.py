@@ -53,7 +53,7 @@ def decode(encoded: Encoded) -> Gaussians:
     )
 
 
-def padded(gaussians: Gaussians, sh_degree: int | None) -> Gaussians:
+def pad_harmonics(gaussians: Gaussians, sh_degree: int | None) -> Gaussians:
     """Return the Gaussians with harmonics extended by zeros, never cut, to a degree.
 
     Raises:

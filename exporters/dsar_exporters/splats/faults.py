@@ -14,7 +14,14 @@ from dsar.geometry.harmonics import C0
 from dsar_exporters.optional import require
 from dsar_exporters.splats.compressed import CHUNK, chunk_faults
 from dsar_exporters.splats.encoding import Encoded
-from dsar_exporters.splats.reading import content, encoded_ply, foreign, is_spz, read_file, read_spz
+from dsar_exporters.splats.reading import (
+    describe_foreign,
+    encoded_ply,
+    is_spz,
+    read_file,
+    read_spz,
+    read_start,
+)
 
 _GLB = b"glTF"
 _SHORTEST = 1e-12
@@ -25,7 +32,7 @@ _FEW = 4
 """Gaussians that make a cloud: of fewer, any may hold the others."""
 _SPACINGS = 2.0
 """Distances between neighbours that standard deviations, nearly all alike, do not exceed."""
-_ASKED = 64
+_MAX_SAMPLED = 64
 """Gaussians whose nearest neighbour is looked for."""
 _OPACITY_SPREAD, _OPACITY_COUNT = 0.5, 16
 """How far, and of how many Gaussians, opacities go within 0 to 1 when they are no logits by accident."""
@@ -66,8 +73,8 @@ def glb_faults(path: Path) -> Iterator[str]:
     """
     fourdgs = require("fourdgs", feature="GLB", package="fourdgs", extra="ply")
     expected = f"{path}: expected a GLB with KHR_gaussian_splatting, found"
-    if (start := content(path, 4)) != _GLB:
-        raise ExportError(f"{expected} {foreign(start)}")
+    if (start := read_start(path, 4)) != _GLB:
+        raise ExportError(f"{expected} {describe_foreign(start)}")
     try:
         scene = fourdgs.from_gltf(str(path)).gaussians
     except fourdgs.FourdgsError as error:
@@ -115,9 +122,9 @@ def _properties(encoded: Encoded) -> dict[str, Float32[np.ndarray, "..."]]:
 
 def _finite_faults(name: str, values: Float32[np.ndarray, "..."]) -> Iterator[str]:
     kinds = {"NaN": np.isnan(values), "inf": np.isposinf(values), "-inf": np.isneginf(values)}
-    found = [f"{int(where.sum())} {kind}" for kind, where in kinds.items() if where.any()]
-    if found:
-        yield f"expected finite {name}, found {', '.join(found)} among {values.size} values"
+    counts = [f"{int(where.sum())} {kind}" for kind, where in kinds.items() if where.any()]
+    if counts:
+        yield f"expected finite {name}, found {', '.join(counts)} among {values.size} values"
 
 
 def _opacity_faults(logits: Float32[np.ndarray, " n"]) -> Iterator[str]:
@@ -182,6 +189,6 @@ def _are_lengths(
     """
     if not (logarithms.min() > 0 and np.median(logarithms) < 1):
         return False
-    asked = np.linspace(0, len(centers) - 1, min(_ASKED, len(centers))).astype(np.int64)
-    nearest = [np.partition(np.linalg.norm(centers - centers[each], axis=1), 1)[1] for each in asked]
+    sampled = np.linspace(0, len(centers) - 1, min(_MAX_SAMPLED, len(centers))).astype(np.int64)
+    nearest = [np.partition(np.linalg.norm(centers - centers[index], axis=1), 1)[1] for index in sampled]
     return typical_size > _SPACINGS * float(np.median(nearest))

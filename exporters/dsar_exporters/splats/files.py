@@ -63,8 +63,7 @@ class SplatSequence(ABC):
             self._written.append(path)
 
         yield write
-        facts = {"up_axis": "Y", "color_space": "srgb_rec709_display"}
-        self._written.append(write_manifest(self.folder, sequence, self._written, facts))
+        self._written.append(write_manifest(self.folder, sequence, self._written))
 
     def written(self) -> Sequence[Path]:
         """Return the files of the last pass."""

@@ -53,11 +53,10 @@ class GltfSnapshot:
 
             yield write
             draft.with_name("draft.glb").replace(draft)
-        facts = {"up_axis": "Y", "color_space": "srgb_rec709_display"}
         first = GaussianSequence(
             frames, sequence.fps, sequence.num_gaussians, sequence.produce, sequence.provenance
         )
-        write_manifest(self.path, first, [self.path], facts)
+        write_manifest(self.path, first, [self.path])
 
     def estimated_bytes(self, first: Gaussians, frames: int) -> int:
         """Return how large the file will be; see `Output`."""

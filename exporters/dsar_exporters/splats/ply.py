@@ -16,7 +16,7 @@ from dsar.errors import ExportError
 from dsar.types import Gaussians, GaussianSequence
 from dsar_exporters.delivery import export
 from dsar_exporters.optional import require
-from dsar_exporters.splats.encoding import Encoded, encode, padded
+from dsar_exporters.splats.encoding import Encoded, encode, pad_harmonics
 from dsar_exporters.splats.files import SplatSequence
 
 
@@ -63,7 +63,7 @@ class PlySequence(SplatSequence):
     def write_frame(self, draft: Path, gaussians: Gaussians, sequence: GaussianSequence, frame: int) -> None:
         """Write one frame."""
         plyfile = require_plyfile()
-        vertices = _records(encode(padded(gaussians, self.sh_degree)))
+        vertices = _records(encode(pad_harmonics(gaussians, self.sh_degree)))
         element = plyfile.PlyElement.describe(vertices, "vertex")
         plyfile.PlyData([element], byte_order="<", comments=_comments(sequence, frame)).write(draft)
 
@@ -112,6 +112,6 @@ def _comments(sequence: GaussianSequence, frame: int) -> list[str]:
         "colorspace": "srgb_rec709_display",
     }
     # Brush takes three numbers literally, but reads the letter y as minus y.
-    known = ["SplatRenderMode: default", "Vertical axis: 0 1 0"]
+    standard = ["SplatRenderMode: default", "Vertical axis: 0 1 0"]
     lines = [" ".join(f"dsar.{key} {value}".split()) for key, value in notes.items()]
-    return known + [line.encode("ascii", "backslashreplace").decode() for line in lines]
+    return standard + [line.encode("ascii", "backslashreplace").decode() for line in lines]

@@ -60,7 +60,7 @@ def read_ply(path: Path) -> Gaussians:
 
 def is_spz(path: Path) -> bool:
     """Return whether a file is to be read as SPZ: by its first bytes, by its suffix if these say nothing."""
-    start = content(path, 4) if path.is_file() else b""
+    start = read_start(path, 4) if path.is_file() else b""
     return start.startswith((_GZIP, _NGSP)) or (path.suffix.lower() == ".spz" and not start.startswith(_PLY))
 
 
@@ -72,9 +72,9 @@ def read_file(path: Path) -> PlyFile:
         MissingDependencyError: plyfile is not installed.
     """
     plyfile = require_plyfile()
-    data = content(path)
+    data = read_start(path)
     if not data.startswith(_PLY):
-        raise ExportError(f"{path}: expected a PLY, found {foreign(data)}")
+        raise ExportError(f"{path}: expected a PLY, found {describe_foreign(data)}")
     end = data[:_HEADER_BYTES].find(_HEADER_END)
     if end < 0:
         raise ExportError(f"{path}: expected a PLY, found no end of its header: it was cut short")
@@ -114,13 +114,13 @@ def encoded_ply(elements: Mapping[str, np.ndarray], where: str) -> Encoded:
     if len(rest_names) not in _REST_COUNTS:
         raise ExportError(f"{where}: expected 0, 9, 24 or 45 properties f_rest_*, found {len(rest_names)}")
     count = len(rest_names) // 3 + 1
-    wanted = [field for field in property_names(count) if field[0] != "n"]
-    if missing := [field for field in wanted if field not in names]:
+    required = [field for field in property_names(count) if field[0] != "n"]
+    if missing := [field for field in required if field not in names]:
         raise ExportError(
             f"{where}: expected a Gaussian splat PLY, found {_kind(elements)} no properties "
             f"{', '.join(missing)}"
         )
-    for field in wanted:
+    for field in required:
         if vertices.dtype[field].kind != "f":
             raise ExportError(
                 f"{where}: expected a float or double in {field}, found {_type(vertices.dtype[field])}: what "
@@ -193,7 +193,7 @@ def read_spz(path: Path) -> Encoded:
 
 def _spz_version(path: Path) -> int:
     """Return the version in an SPZ's header, which is compressed up to version 3."""
-    head = content(path, 8)
+    head = read_start(path, 8)
     if head.startswith(_GZIP):
         try:
             with gzip.open(path) as file:
@@ -201,18 +201,18 @@ def _spz_version(path: Path) -> int:
         except (gzip.BadGzipFile, EOFError, zlib.error) as error:
             raise ExportError(f"{path}: expected an SPZ file, found gzip that is broken: {error}") from error
     if len(head) < 8 or not head.startswith(_NGSP):
-        raise ExportError(f"{path}: expected an SPZ file, found {foreign(head)}")
+        raise ExportError(f"{path}: expected an SPZ file, found {describe_foreign(head)}")
     return struct.unpack_from("<I", head, 4)[0]
 
 
-def foreign(start: bytes) -> str:
+def describe_foreign(start: bytes) -> str:
     """Return what a file is that is none of ours."""
     if start.startswith(_APPLE):
         return "what macOS notes about the file of this name without ._"
     return f"one that starts with {start[:4]!r}" if start else "an empty file"
 
 
-def content(path: Path, count: int = -1) -> bytes:
+def read_start(path: Path, count: int = -1) -> bytes:
     """Return a file's first bytes, all by default.
 
     Raises:

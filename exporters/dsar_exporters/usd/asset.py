@@ -21,8 +21,10 @@ from dsar.geometry.camera_paths import TURNTABLE, turntable
 from dsar.types import Camera, Gaussians, GaussianSequence
 from dsar_exporters.usd.body import BODY, MESH, BodyWriter
 from dsar_exporters.usd.cameras import define_camera, world_matrix
+from dsar_exporters.usd.levels import Level, make_levels
 from dsar_exporters.usd.names import clips_folder, payload_path
-from dsar_exporters.usd.particles import INSTANCER, SPLATS, Frame, Level, ParticleWriter, make_levels
+from dsar_exporters.usd.particle_frame import ParticleFrame
+from dsar_exporters.usd.particles import INSTANCER, SPLATS, ParticleWriter
 from dsar_exporters.usd.timeline import ClipTimeline, LayerTimeline, Timeline
 
 PROXY = "proxy"
@@ -59,7 +61,7 @@ class AssetWriter:
         else:
             self._payload_path, self._data, self._arc = path, self._stage, ""
         self._layer = LayerTimeline(self._data.GetRootLayer())
-        self._clips = ClipTimeline(_made(clips_folder(path)), path.stem) if clips else None
+        self._clips = ClipTimeline(_make_folder(clips_folder(path)), path.stem) if clips else None
         self._levels: list[Level] = []
         self._particles: list[ParticleWriter] = []
         self._bounds: dict[str, Float32[np.ndarray, "2 3"]] = {}
@@ -110,11 +112,11 @@ class AssetWriter:
     def _write_earlier(self, velocities: torch.Tensor) -> None:
         assert self._earlier is not None
         frame, gaussians = self._earlier
-        values = Frame.of(gaussians, velocities)
+        values = ParticleFrame.from_gaussians(gaussians, velocities)
         for level, writer in zip(self._levels, self._particles, strict=True):
             bounds = writer.write(frame, values)
-            known = self._bounds.get(level.name, bounds)
-            widest = np.minimum(known[0], bounds[0]), np.maximum(known[1], bounds[1])
+            so_far = self._bounds.get(level.name, bounds)
+            widest = np.minimum(so_far[0], bounds[0]), np.maximum(so_far[1], bounds[1])
             self._bounds[level.name] = np.stack(widest)
         if self._body is not None:
             self._body.write(frame, self._count)
@@ -126,10 +128,10 @@ class AssetWriter:
     def _author_bounds(self) -> None:
         """Let applications frame the asset, at any level, before they load its payload."""
         model = UsdGeom.ModelAPI.Apply(self._stage.GetDefaultPrim())
-        details = model.GetPrim().GetVariantSet("lod")
+        lods = model.GetPrim().GetVariantSet("lod")
         for level in reversed(self._levels):
-            details.SetVariantSelection(level.name)
-            with details.GetVariantEditContext():
+            lods.SetVariantSelection(level.name)
+            with lods.GetVariantEditContext():
                 model.SetExtentsHint(Vt.Vec3fArray.FromNumpy(self._bounds[level.name]))
 
     def _author_levels(self, gaussians: Gaussians, frame: int) -> None:
@@ -152,27 +154,27 @@ class AssetWriter:
                 )
             )
         root = self._stage.GetDefaultPrim()
-        details = root.GetVariantSets().AddVariantSet("lod")
+        lods = root.GetVariantSets().AddVariantSet("lod")
         for level in self._levels:
-            details.AddVariant(level.name)
-            details.SetVariantSelection(level.name)
-            with details.GetVariantEditContext():
-                self._bring_in(root, f"/{level.name}")
-        details.SetVariantSelection(self._levels[0].name)
+            lods.AddVariant(level.name)
+            lods.SetVariantSelection(level.name)
+            with lods.GetVariantEditContext():
+                self._add_payload(root, f"/{level.name}")
+        lods.SetVariantSelection(self._levels[0].name)
         self._author_representations()
 
     def _author_representations(self) -> None:
         """Author the variant set that shows one representation and hides the others."""
         root = self._stage.GetDefaultPrim()
-        shown = {INSTANCER: INSTANCER, SPLATS: SPLATS}
+        paths = {INSTANCER: INSTANCER, SPLATS: SPLATS}
         if self._sequence.binding is not None:
-            shown[PROXY] = f"{BODY}/{MESH}"
+            paths[PROXY] = f"{BODY}/{MESH}"
         variants = root.GetVariantSets().AddVariantSet("representation")
-        for name in shown:
+        for name in paths:
             variants.AddVariant(name)
             variants.SetVariantSelection(name)
             with variants.GetVariantEditContext():
-                for other, path in shown.items():
+                for other, path in paths.items():
                     if other != name:
                         prim = self._stage.OverridePrim(root.GetPath().AppendPath(path))
                         UsdGeom.Imageable(prim).CreateVisibilityAttr(UsdGeom.Tokens.invisible)
@@ -186,11 +188,11 @@ class AssetWriter:
         writer = BodyWriter(self._data, self._layer, binding)
         self._as_data(f"/{BODY}")
         root = self._stage.GetDefaultPrim()
-        self._bring_in(self._stage.DefinePrim(root.GetPath().AppendChild(BODY)), f"/{BODY}")
+        self._add_payload(self._stage.DefinePrim(root.GetPath().AppendChild(BODY)), f"/{BODY}")
         return writer
 
     def _author_cameras(self, cameras: Sequence[Camera]) -> None:
-        """Author the capture's cameras, and one that circles the body."""
+        """Author the capture's cameras, and the turntable."""
         sequence = self._sequence
         if not cameras and sequence.binding is None:
             return
@@ -198,19 +200,19 @@ class AssetWriter:
             self._stage, self._stage.GetDefaultPrim().GetPath().AppendChild("cameras")
         )
         for camera in cameras:
-            place = define_camera(self._stage, scope.GetPath().AppendChild(camera.name), camera)
-            place.Set(world_matrix(camera))
+            transform = define_camera(self._stage, scope.GetPath().AppendChild(camera.name), camera)
+            transform.Set(world_matrix(camera))
         if sequence.binding is not None:
             width, height = (cameras[0].width, cameras[0].height) if cameras else _TURNTABLE_SIZE
-            circling = turntable(
+            orbit = turntable(
                 sequence.binding, sequence.frame_numbers, sequence.fps, width=width, height=height
             )
-            place = define_camera(self._data, f"/{TURNTABLE}", circling.cameras[0])
-            for frame, camera in zip(sequence.frame_numbers, circling.cameras, strict=True):
-                self._layer.sample(place, frame, world_matrix(camera))
+            transform = define_camera(self._data, f"/{TURNTABLE}", orbit.cameras[0])
+            for frame, camera in zip(sequence.frame_numbers, orbit.cameras, strict=True):
+                self._layer.sample(transform, frame, world_matrix(camera))
             self._as_data(f"/{TURNTABLE}")
             prim = self._stage.DefinePrim(scope.GetPath().AppendChild(TURNTABLE))
-            self._bring_in(prim, f"/{TURNTABLE}")
+            self._add_payload(prim, f"/{TURNTABLE}")
 
     def _define_data(self, path: str) -> None:
         UsdGeom.Xform.Define(self._data, path)
@@ -221,7 +223,7 @@ class AssetWriter:
         if not self._arc:
             self._data.GetPrimAtPath(path).SetSpecifier(Sdf.SpecifierClass)
 
-    def _bring_in(self, prim: Usd.Prim, path: str) -> None:
+    def _add_payload(self, prim: Usd.Prim, path: str) -> None:
         """Let a prim of the root hold what lies at a path of the data."""
         if self._arc:
             prim.GetPayloads().AddPayload(self._arc, path)
@@ -229,7 +231,7 @@ class AssetWriter:
             prim.GetPayloads().AddInternalPayload(path)
 
 
-def _made(folder: Path) -> Path:
+def _make_folder(folder: Path) -> Path:
     folder.mkdir()
     return folder
 

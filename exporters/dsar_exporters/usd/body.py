@@ -13,7 +13,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
 from dsar.geometry.rotations import quaternion_from_matrix
 from dsar.types import Binding, Body
-from dsar_exporters.usd.particles import largest_influences
+from dsar_exporters.usd.influences import largest_influences
 from dsar_exporters.usd.timeline import Timeline
 
 BODY, MESH = "body", "mesh"
@@ -34,7 +34,7 @@ class BodyWriter:
         self._influences = largest_influences(body.weights, _INFLUENCES)
         self._rotations = np.zeros((len(body.joints), 4))
         points = body.vertices.float().numpy()
-        self._boxes, self._holds = _boxes(points, *self._influences, len(body.joints))
+        self._boxes, self._carries = _boxes(points, *self._influences, len(body.joints))
         self._root = UsdSkel.Root.Define(stage, f"/{BODY}")
         self._define_skeleton(stage)
         self._define_mesh(stage)
@@ -98,22 +98,22 @@ class BodyWriter:
         A vertex lies among the places to which its joints would carry it, so that the boxes of what each
         joint holds at rest, carried, hold the mesh; up to decimetres more than it needs.
         """
-        carried = self._boxes @ transforms[:, :3, :3].swapaxes(1, 2) + transforms[:, None, :3, 3]
-        points = carried[self._holds].reshape(-1, 3)
+        boxes = self._boxes @ transforms[:, :3, :3].swapaxes(1, 2) + transforms[:, None, :3, 3]
+        points = boxes[self._carries].reshape(-1, 3)
         return np.stack([points.min(0), points.max(0)]).astype(np.float32)
 
 
 def _boxes(
     points: Float32[np.ndarray, "v 3"], indices: np.ndarray, weights: Float32[np.ndarray, "v c"], joints: int
 ) -> tuple[Float64[np.ndarray, "j 8 3"], Bool[np.ndarray, " j"]]:
-    """Return the corners of the box about what each joint holds, and which joints hold anything."""
-    corners, holds = np.zeros((joints, 8, 3)), np.zeros(joints, bool)
+    """Return the corners of the box about the vertices of each joint, and which joints have any."""
+    corners, carries = np.zeros((joints, 8, 3)), np.zeros(joints, bool)
     for joint in range(joints):
-        held = points[((indices == joint) & (weights > 0)).any(1)]
-        if len(held):
-            box, holds[joint] = (held.min(0), held.max(0)), True
+        carried = points[((indices == joint) & (weights > 0)).any(1)]
+        if len(carried):
+            box, carries[joint] = (carried.min(0), carried.max(0)), True
             corners[joint] = [[box[i][0], box[j][1], box[k][2]] for i, j, k in np.ndindex(2, 2, 2)]
-    return corners, holds
+    return corners, carries
 
 
 def joint_paths(names: tuple[str, ...], parents: tuple[int, ...]) -> list[str]:

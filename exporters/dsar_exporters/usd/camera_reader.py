@@ -8,7 +8,6 @@ Imports pxr: only `dsar_exporters.usd` imports this module, when it reads.
 
 import logging
 import math
-import re
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
@@ -23,12 +22,10 @@ from dsar.geometry.camera_paths import START_FRAME, CameraPath
 from dsar.geometry.frame_rates import exact_rate, same_rate
 from dsar.geometry.rotations import nearest_rotation
 from dsar.types import Camera
-from dsar_exporters.usd.stages import open_stage
+from dsar_exporters.usd.camera_names import find_cameras, with_ancestors
 
 _logger = logging.getLogger(__name__)
 
-_OBJECT_NAME = "userProperties:blender:object_name"
-"""Blender writes its object as an Xform and the object's data as a prim within."""
 _FITS = 0.01
 """How far the aspects of aperture and picture may differ and mean the same: rounding to whole pixels."""
 _Y_UP_FROM_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
@@ -38,7 +35,7 @@ _STATE = 5
 
 def list_cameras(path: Path) -> list[str]:
     """Return the names of a stage's cameras; see `dsar_exporters.usd.list_usd_cameras`."""
-    return list(_find(path)[1])
+    return list(find_cameras(path)[1])
 
 
 def read_cameras(
@@ -49,7 +46,7 @@ def read_cameras(
     chosen: Collection[str] | None,
 ) -> list[CameraPath]:
     """Read cameras; see `dsar_exporters.usd.read_usd_cameras`."""
-    stage, prims = _find(path)
+    stage, prims = find_cameras(path)
     if not stage.HasAuthoredMetadata("metersPerUnit"):
         _logger.warning("%s: says no metersPerUnit; read in centimetres, as USD has it", path)
     return [
@@ -59,26 +56,13 @@ def read_cameras(
     ]
 
 
-def _find(path: Path) -> tuple[Usd.Stage, dict[str, Usd.Prim]]:
-    """Return a stage, which prims do not keep open, and its cameras in order by the names we give them."""
-    if not path.is_file():
-        raise ExportError(f"{path}: expected a USD file with cameras, found none: give its path")
-    stage = open_stage(path)
-    _mend_types(stage)
-    every = Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies())
-    prims = [prim for prim in every if prim.IsA(UsdGeom.Camera)]
-    if not prims:
-        raise ExportError(f"{path}: expected cameras, found none: export them too, or name another file")
-    return stage, dict(zip(_names(prims), prims, strict=True))
-
-
 class _CameraReader:
     """One camera prim, and how errors call it."""
 
     def __init__(self, prim: Usd.Prim, name: str, where: str) -> None:
         self._prim, self._name, self._where = prim, name, where
         self._schema = UsdGeom.Camera(prim)
-        self._placed = [UsdGeom.Xformable(p) for p in _with_ancestors(prim) if p.IsA(UsdGeom.Xformable)]
+        self._xforms = [UsdGeom.Xformable(p) for p in with_ancestors(prim) if p.IsA(UsdGeom.Xformable)]
         self._lens = [
             self._schema.GetFocalLengthAttr(),
             self._schema.GetHorizontalApertureAttr(),
@@ -96,7 +80,7 @@ class _CameraReader:
         ratio = self._ratio(fps) if self._may_move() else 1.0
         if ratio != 1:
             # The stage's own time codes around the keys: between them USD may interpolate matrices, which
-            # shears what turns, and a path turns.
+            # shears what rotates, and a path rotates.
             times = [START_FRAME + (key - START_FRAME) / ratio for key in keys]
             keys = sorted({math.floor(time) + step for time in times for step in (0, 1)})
         if not (self._may_move() and self._moves_at(keys)):
@@ -121,7 +105,7 @@ class _CameraReader:
 
     def _may_move(self) -> bool:
         return any(attribute.ValueMightBeTimeVarying() for attribute in self._lens) or any(
-            each.TransformMightBeTimeVarying() for each in self._placed
+            xform.TransformMightBeTimeVarying() for xform in self._xforms
         )
 
     def _moves_at(self, keys: Sequence[int]) -> bool:
@@ -136,7 +120,7 @@ class _CameraReader:
         return False
 
     def _sample_times(self) -> list[float]:
-        return sorted({time for each in (*self._lens, *self._placed) for time in each.GetTimeSamples()})
+        return sorted({time for source in (*self._lens, *self._xforms) for time in source.GetTimeSamples()})
 
     def _states(self, times: Sequence[float | int]) -> Float[np.ndarray, "t 21"]:
         """Return lens and place at times: focal length, apertures, their offsets, local-to-world matrix."""
@@ -182,17 +166,17 @@ class _CameraReader:
 
         Pixels that are not square make the aspects differ; the resolution that we note tells of them.
         """
-        own = self._noted()
+        own = self._noted_resolution()
         aspects = [aperture] if own is None else [aperture, own[0] / own[1]]
         return any(abs(aspect / picture - 1) <= _FITS for aspect in aspects)
 
-    def _noted(self) -> tuple[int, int] | None:
+    def _noted_resolution(self) -> tuple[int, int] | None:
         """Return the resolution that `define_camera` noted."""
-        noted = self._prim.GetCustomDataByKey("dsar:resolution")
-        return None if noted is None else (int(noted[0]), int(noted[1]))
+        resolution = self._prim.GetCustomDataByKey("dsar:resolution")
+        return None if resolution is None else (int(resolution[0]), int(resolution[1]))
 
     def _size(self, resolution: tuple[int, int] | None) -> tuple[int, int]:
-        size = resolution or self._noted()
+        size = resolution or self._noted_resolution()
         if size is None:
             raise ExportError(
                 f"{self._where}: expected a resolution, found none in the file: give --res WIDTH HEIGHT"
@@ -221,83 +205,12 @@ class _CameraReader:
         return result
 
 
-def _mend_types(stage: Usd.Stage) -> None:
-    """Make cameras, in memory, of those that Blender calls transforms.
-
-    With "Merge parent Xform", Blender 4.5 defines a camera that moves again as an Xform, after its lens.
-    """
-    mistaken = [
-        prim
-        for prim in stage.Traverse()
-        if prim.GetTypeName() == "Xform" and prim.HasAttribute(UsdGeom.Tokens.horizontalAperture)
-    ]
-    with Usd.EditContext(stage, stage.GetSessionLayer()):
-        for prim in mistaken:
-            prim.SetTypeName("Camera")
-
-
 def _rate(stage: Usd.Stage) -> float | None:
     """Return the time codes per second, if the stage says how many."""
-    said = any(stage.HasAuthoredMetadata(f"{unit}PerSecond") for unit in ("timeCodes", "frames"))
-    return stage.GetTimeCodesPerSecond() if said else None
+    states_rate = any(stage.HasAuthoredMetadata(f"{unit}PerSecond") for unit in ("timeCodes", "frames"))
+    return stage.GetTimeCodesPerSecond() if states_rate else None
 
 
 def _constant(states: Float[np.ndarray, "t 21"]) -> bool:
     # Between equal samples interpolation may round.
     return np.allclose(states, states[0], rtol=1e-9, atol=1e-12)
-
-
-def _with_ancestors(prim: Usd.Prim) -> list[Usd.Prim]:
-    chain = [prim]
-    while (parent := chain[-1].GetParent()) and not parent.IsPseudoRoot():
-        chain.append(parent)
-    return chain
-
-
-def _names(prims: Sequence[Usd.Prim]) -> list[str]:
-    """Return names that differ and are identifiers: of the objects, led by parents' where those are equal."""
-    chains = [[each.GetName() for each in _with_ancestors(_object(prim))] for prim in prims]
-    lengths = [1] * len(prims)
-    while True:
-        names = [
-            _identifier("_".join(reversed(chain[:length])))
-            for chain, length in zip(chains, lengths, strict=True)
-        ]
-        longer = [
-            length + (names.count(name) > 1 and length < len(chain))
-            for name, chain, length in zip(names, chains, lengths, strict=True)
-        ]
-        if longer == lengths:
-            return _told_apart(names)
-        lengths = longer
-
-
-def _told_apart(names: Sequence[str]) -> list[str]:
-    """Return names with numbers where whole paths are one identifier, such as those of two shapes."""
-    result: list[str] = []
-    for name in names:
-        number, free = 1, name
-        while free in result:
-            number += 1
-            free = f"{name}_{number}"
-        result.append(free)
-    return result
-
-
-def _object(prim: Usd.Prim) -> Usd.Prim:
-    """Return the prim whose name the camera's author knows.
-
-    Blender and Maya write an object's transform and its data as two prims; then the data has no transform of
-    its own, and its name is one that nobody chose.
-    """
-    parent = prim.GetParent()
-    if not parent.IsA(UsdGeom.Xform) or UsdGeom.Xformable(prim).GetXformOpOrderAttr().HasAuthoredValue():
-        return prim
-    cameras = [child for child in parent.GetChildren() if child.IsA(UsdGeom.Camera)]
-    moved = UsdGeom.Xformable(parent).GetXformOpOrderAttr().HasAuthoredValue()
-    return parent if len(cameras) == 1 and (moved or parent.HasAttribute(_OBJECT_NAME)) else prim
-
-
-def _identifier(name: str) -> str:
-    plain = re.sub(r"[^A-Za-z0-9_]", "_", name)
-    return f"cam_{plain}" if plain[0].isdigit() else plain

@@ -22,14 +22,14 @@ def project_with_frustums(
     """Return projections; see `dsar_exporters.usd.read_usd_projections`."""
     stage = Usd.Stage.Open(str(path))
     prims = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Camera)]
-    found = {prim.GetName(): UsdGeom.Camera(prim) for prim in prims if prim.GetName() in sizes}
-    if missing := sorted(set(sizes) - set(found)):
+    cameras = {prim.GetName(): UsdGeom.Camera(prim) for prim in prims if prim.GetName() in sizes}
+    if missing := sorted(set(sizes) - set(cameras)):
         raise ExportError(
-            f"{path}: expected cameras {', '.join(missing)}, found {', '.join(found) or 'none'}"
+            f"{path}: expected cameras {', '.join(missing)}, found {', '.join(cameras) or 'none'}"
         )
     time = Usd.TimeCode(stage.GetStartTimeCode())
-    into = _stage_from_world(stage)
-    return {name: _projection(found[name], time, *size) @ into for name, size in sizes.items()}
+    stage_from_world = _stage_from_world(stage)
+    return {name: _projection(cameras[name], time, *size) @ stage_from_world for name, size in sizes.items()}
 
 
 def _stage_from_world(stage: Usd.Stage) -> np.ndarray:

@@ -6,118 +6,27 @@ Imports pxr: only the writers of an asset import this module.
 # pxr is compiled and carries no type stubs.
 # pyright: reportAttributeAccessIssue=false
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float16, Float32, Int64
+from jaxtyping import Float32
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdVol, Vt
 
-from dsar.color import linear_from_srgb
-from dsar.geometry.harmonics import C0
-from dsar.types import Binding, Gaussians
+from dsar.types import Binding
 from dsar_exporters.color import LINEAR_REC709
-from dsar_exporters.usd.timeline import Timeline, Values
+from dsar_exporters.usd.influences import largest_influences
+from dsar_exporters.usd.levels import Level
+from dsar_exporters.usd.particle_frame import ParticleFrame
+from dsar_exporters.usd.timeline import SharedValue, Timeline
 
 INSTANCER, SPLATS = "instancer", "splats"
 SIGMA_SCALE = 2.0
 """Standard deviations to the surface of an ellipsoid: it then looks about as large as the splat."""
-EXTENT_SIGMAS = 3.0
 INFLUENCES = 4
-"""Joints that a Gaussian's authored skin weights name, the largest ones."""
-_MIN_SCALE = np.float32(1e-8)
-"""Metres: the schema has no Gaussians without extent."""
+"""Joints that a Gaussian's authored skin weights name, those with the largest weights."""
 COLOR_SPACE = "srgb_rec709_display"
 """The Color Interop Forum's id, as other splat writers use it; Gf has no display-referred names yet."""
-
-
-@dataclass(frozen=True)
-class Level:
-    """A level of detail: some of the Gaussians, enlarged to cover for the others."""
-
-    name: str
-    ids: Int64[np.ndarray, " m"]
-    """Indices into the full set: the ids that every level shares."""
-    enlargement: float
-    """Factor on standard deviations, which keeps the area that is covered."""
-
-    def of(self, frame: "Frame") -> "Frame":
-        """Return this level's share of a frame."""
-        if len(self.ids) == len(frame.means):
-            return frame
-        chosen = {name: values.take(self.ids, 0) for name, values in vars(frame).items()}
-        grown = np.float32(self.enlargement)
-        return Frame(**{**chosen, "scales": chosen["scales"] * grown, "reach": chosen["reach"] * grown})
-
-
-@dataclass(frozen=True)
-class Frame:
-    """Everything that one frame's prims hold of the Gaussians, as arrays in USD's order."""
-
-    means: Float32[np.ndarray, "n 3"]
-    xyzw: Float32[np.ndarray, "n 4"]
-    """Quaternions as Vt's buffers hold them."""
-    half_xyzw: Float16[np.ndarray, "n 4"]
-    velocities: Float32[np.ndarray, "n 3"]
-    """Metres per second."""
-    scales: Float32[np.ndarray, "n 3"]
-    opacities: Float32[np.ndarray, " n"]
-    harmonics: Float32[np.ndarray, "n k 3"]
-    colors: Float32[np.ndarray, "n 3"]
-    """Linear, without what depends on the view."""
-    reach: Float32[np.ndarray, "n 3"]
-    """How far three standard deviations extend along the world's axes, metres."""
-
-    @classmethod
-    def of(cls, gaussians: Gaussians, velocities: Float32[torch.Tensor, "n 3"]) -> "Frame":
-        """Return a frame's arrays."""
-        xyzw = gaussians.rotations[:, [1, 2, 3, 0]].numpy()
-        dc = gaussians.harmonics[:, 0].numpy()
-        return cls(
-            means=gaussians.means.numpy(),
-            xyzw=xyzw,
-            half_xyzw=xyzw.astype(np.float16),
-            velocities=velocities.contiguous().numpy(),
-            scales=np.maximum(gaussians.scales.numpy(), _MIN_SCALE),
-            opacities=gaussians.opacities.numpy(),
-            harmonics=gaussians.harmonics.numpy(),
-            colors=linear_from_srgb(dc * np.float32(C0) + np.float32(0.5)),
-            reach=axis_extents(gaussians.rotations.numpy(), gaussians.scales.numpy()),
-        )
-
-    def bounds(self) -> Float32[np.ndarray, "2 3"]:
-        """Return the lower and upper corner, metres, of all Gaussians out to three standard deviations."""
-        if not len(self.means):
-            return np.zeros((2, 3), np.float32)
-        return np.stack([(self.means - self.reach).min(0), (self.means + self.reach).max(0)])
-
-
-def make_levels(points: Float32[np.ndarray, "n 3"]) -> list[Level]:
-    """Return the levels full, half and quarter of Gaussians that lie at these points at rest.
-
-    The points are put in the order of a space-filling curve, of which every second or fourth is kept: thinned
-    evenly, and the quarter is part of the half.
-    """
-    order = _along_curve(points)
-    return [
-        Level("full", np.arange(len(points)), 1.0),
-        Level("half", np.sort(order[::2]), 2**0.5),
-        Level("quarter", np.sort(order[::4]), 2.0),
-    ]
-
-
-def _along_curve(points: Float32[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
-    """Return points' indices in Morton order."""
-    if not len(points):
-        return np.zeros(0, np.int64)
-    span = max(float(np.ptp(points, axis=0).max()), 1e-9)
-    cells = ((points - points.min(0)) / span * 1023).astype(np.uint64)
-    codes = np.zeros(len(points), np.uint64)
-    for bit in range(10):
-        for axis in range(3):
-            codes |= ((cells[:, axis] >> np.uint64(bit)) & np.uint64(1)) << np.uint64(3 * bit + axis)
-    return np.argsort(codes, kind="stable")
 
 
 class ParticleWriter:
@@ -150,23 +59,23 @@ class ParticleWriter:
         for color in colors:
             color.SetColorSpace(LINEAR_REC709)
         opacities = [_primvar(prim, "displayOpacity", Sdf.ValueTypeNames.FloatArray) for prim in prims]
-        harmonics = self._own("RadianceSphericalHarmonicsCoefficients")
+        harmonics = self._splat_attribute("RadianceSphericalHarmonicsCoefficients")
         harmonics.SetMetadata("elementSize", harmonics_count)
         harmonics.SetMetadata("interpolation", UsdGeom.Tokens.vertex)
 
-        def values(*attributes: Usd.Attribute) -> Values:
-            return Values(timeline, first_frame, *attributes)
+        def shared(*attributes: Usd.Attribute) -> SharedValue:
+            return SharedValue(timeline, first_frame, *attributes)
 
-        self._instance_scales = values(self._instancer.CreateScalesAttr())
-        self._scales = values(self._own("Scales"))
-        self._harmonics = values(harmonics)
-        self._colors = values(*colors)
+        self._instance_scales = shared(self._instancer.CreateScalesAttr())
+        self._scales = shared(self._splat_attribute("Scales"))
+        self._harmonics = shared(harmonics)
+        self._colors = shared(*colors)
         # Of what is float in any case, splats and instances share one array.
-        self._opacities = values(*opacities, *([] if half else [self._own("Opacities")]))
-        self._half_opacities = values(self._own("Opacities")) if half else None
+        self._opacities = shared(*opacities, *([] if half else [self._splat_attribute("Opacities")]))
+        self._half_opacities = shared(self._splat_attribute("Opacities")) if half else None
 
-    def _own(self, name: str) -> Usd.Attribute:
-        """Return an attribute of the splats in the precision that was asked for."""
+    def _splat_attribute(self, name: str) -> Usd.Attribute:
+        """Return an attribute of the splats in the precision of the export."""
         return getattr(self._splats, f"Create{name}{'h' if self._half else ''}Attr")()
 
     def _define_instancer(self, stage: Usd.Stage) -> None:
@@ -194,10 +103,10 @@ class ParticleWriter:
         splats.GetPrim().SetCustomDataByKey("dsar:colorSpace", COLOR_SPACE)
         splats.GetPrim().SetCustomDataByKey("dsar:radiance", "color = max(0, harmonics . basis + 0.5)")
 
-    def write(self, number: int, frame: Frame) -> Float32[np.ndarray, "2 3"]:
+    def write(self, number: int, frame: ParticleFrame) -> Float32[np.ndarray, "2 3"]:
         """Write one frame of the full set to both prims and return this level's bounds."""
         instancer, splats = self._instancer, self._splats
-        frame = self._level.of(frame)
+        frame = self._level.select(frame)
         means = Vt.Vec3fArray.FromNumpy(frame.means)
         half_rotations = Vt.QuathArray.FromNumpy(frame.half_xyzw)
         speeds = Vt.Vec3fArray.FromNumpy(frame.velocities)
@@ -223,7 +132,7 @@ class ParticleWriter:
         self._write_appearance(number, frame)
         return bounds
 
-    def _write_appearance(self, number: int, frame: Frame) -> None:
+    def _write_appearance(self, number: int, frame: ParticleFrame) -> None:
         """Write what may stay the same over all frames."""
         precision = np.float16 if self._half else np.float32
         vectors, numbers = (Vt.Vec3hArray, Vt.HalfArray) if self._half else (Vt.Vec3fArray, Vt.FloatArray)
@@ -264,33 +173,6 @@ def _author_binding(prim: Usd.Prim, binding: Binding, level: Level) -> None:
         UsdGeom.Primvar(attribute).SetElementSize(INFLUENCES)
 
 
-def largest_influences(
-    weights: Float32[torch.Tensor, "n j"], count: int
-) -> tuple[np.ndarray, Float32[np.ndarray, "n c"]]:
-    """Return each point's heaviest joints (int32) and their weights, which sum to 1."""
-    found = weights.float().topk(min(count, weights.shape[1]), dim=1)
-    shares = found.values / found.values.sum(1, keepdim=True)
-    return found.indices.int().contiguous().numpy(), shares.contiguous().numpy()
-
-
 def _primvar(prim: Usd.Prim, name: str, kind: Sdf.ValueTypeName) -> Usd.Attribute:
     """Return the attribute of a primvar with one value per particle."""
     return UsdGeom.PrimvarsAPI(prim).CreatePrimvar(name, kind, UsdGeom.Tokens.vertex).GetAttr()
-
-
-def axis_extents(
-    rotations: Float32[np.ndarray, "n 4"], scales: Float32[np.ndarray, "n 3"]
-) -> Float32[np.ndarray, "n 3"]:
-    """Return how far three standard deviations extend along the world's axes, metres; quaternions are wxyz.
-
-    The square of a standard deviation along an axis is the sum of squares of a row of R S.
-    """
-    w, x, y, z = rotations.T
-    a, b, c = scales.T
-    rows = (
-        ((1 - 2 * (y * y + z * z)) * a, 2 * (x * y - w * z) * b, 2 * (x * z + w * y) * c),
-        (2 * (x * y + w * z) * a, (1 - 2 * (x * x + z * z)) * b, 2 * (y * z - w * x) * c),
-        (2 * (x * z - w * y) * a, 2 * (y * z + w * x) * b, (1 - 2 * (x * x + y * y)) * c),
-    )
-    squares = [p * p + q * q + r * r for p, q, r in rows]
-    return np.float32(EXTENT_SIGMAS) * np.sqrt(np.stack(squares, -1))

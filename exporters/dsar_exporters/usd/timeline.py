@@ -114,20 +114,20 @@ class ClipTimeline(Timeline):
             prims: Their paths, the same in the clips.
         """
         self._manifest.Save()
-        place = f"./{self.folder.name}"
+        relative = f"./{self.folder.name}"
         frames = np.array(self._frames, float)
         clips = {
-            "assetPaths": Sdf.AssetPathArray([Sdf.AssetPath(f"{place}/{name}") for name in self._paths]),
+            "assetPaths": Sdf.AssetPathArray([Sdf.AssetPath(f"{relative}/{name}") for name in self._paths]),
             "active": Vt.Vec2dArray.FromNumpy(np.stack([frames, np.arange(len(frames))], -1)),
             "times": Vt.Vec2dArray.FromNumpy(np.stack([frames, frames], -1)),
-            "manifestAssetPath": Sdf.AssetPath(f"{place}/{clips_manifest(self.folder).name}"),
+            "manifestAssetPath": Sdf.AssetPath(f"{relative}/{clips_manifest(self.folder).name}"),
         }
         for prim in prims:
             layer.GetPrimAtPath(prim).SetInfo("clips", {"default": {**clips, "primPath": prim}})
 
 
-class Values:
-    """Attributes that share one value: written once while it stays, over time once it changes."""
+class SharedValue:
+    """One value of several attributes: written once while it stays, over time once it changes."""
 
     def __init__(self, timeline: Timeline, first_frame: int, *attributes: Usd.Attribute) -> None:
         self._timeline, self._attributes = timeline, attributes
@@ -138,14 +138,14 @@ class Values:
     def write(self, frame: int, value: np.ndarray, array: Any) -> None:
         """Write the value of a frame; `array` is the Vt type that holds it."""
         if self._value is None:
-            held = array.FromNumpy(value)
+            constant = array.FromNumpy(value)
             for attribute in self._attributes:
-                self._timeline.hold(attribute, held)
+                self._timeline.hold(attribute, constant)
         elif not self._changes and not np.array_equal(value, self._value):
             self._changes = True
-            held = array.FromNumpy(self._value)
+            constant = array.FromNumpy(self._value)
             for attribute in self._attributes:
-                self._timeline.release(attribute, held, [self._first_frame, self._last_frame])
+                self._timeline.release(attribute, constant, [self._first_frame, self._last_frame])
         if self._changes:
             sample = array.FromNumpy(value)
             for attribute in self._attributes:
@@ -158,10 +158,10 @@ class Values:
 def _spec(layer: Sdf.Layer, attribute: Usd.Attribute) -> Sdf.AttributeSpec:
     """Return a layer's own declaration of an attribute, made if missing."""
     path = attribute.GetPath()
-    found = layer.GetAttributeAtPath(path)
-    if found is None:
+    spec = layer.GetAttributeAtPath(path)
+    if spec is None:
         Sdf.JustCreatePrimAttributeInLayer(
             layer, path, attribute.GetTypeName(), attribute.GetVariability(), attribute.IsCustom()
         )
-        found = layer.GetAttributeAtPath(path)
-    return found
+        spec = layer.GetAttributeAtPath(path)
+    return spec

@@ -77,7 +77,7 @@ def find_llvm() -> Path | None:
     """Return the library of the newest LLVM with which Mitsuba renders here, None if there is none."""
     if importlib.util.find_spec("mitsuba") is None:
         raise MissingDependencyError("dsar crosscheck", "mitsuba", "mitsuba")
-    return next((each for each in candidates() if _renders_with(each)), None)
+    return next((library for library in candidates() if _renders_with(library)), None)
 
 
 def candidates() -> Iterator[Path]:
@@ -85,13 +85,13 @@ def candidates() -> Iterator[Path]:
     if named := os.environ.get(_LIBRARY):
         yield Path(named)
         return
-    found = {
+    libraries = {
         file.resolve()
         for folder in _FOLDERS
         for file in Path("/").glob(f"{folder[1:]}/libLLVM*.so*")
         if file.exists()
     }
-    yield from sorted(found, key=_version, reverse=True)
+    yield from sorted(libraries, key=_version, reverse=True)
 
 
 def _version(library: Path) -> tuple[int, ...]:

@@ -27,7 +27,7 @@ class Choices:
 
     low_pass: bool = True
     """Splats are widened by 0.3 pixels²."""
-    splats: bool = True
+    ewa_projection: bool = True
     """A Gaussian is projected as an ellipse (EWA), rather than met at its densest place along the ray."""
     colors_of_centers: bool = True
     """Harmonics are evaluated towards a Gaussian's centre, rather than along the pixel's own ray."""
@@ -42,7 +42,7 @@ class Step:
     """One more choice made as the ray tracer makes it."""
 
     name: str
-    what: str
+    description: str
     """The same for people."""
     choices: Choices
 
@@ -59,7 +59,7 @@ STEPS = (
 
 
 @dataclass(frozen=True)
-class _Met:
+class _Intersections:
     """Every pixel's ray and every Gaussian."""
 
     powers: Float[np.ndarray, "p n"]
@@ -73,27 +73,27 @@ class _Met:
 def blend(gaussians: Gaussians, camera: Camera, choices: Choices) -> Float[np.ndarray, "h w 4"]:
     """Return colour (premultiplied) and alpha of the pixels' centres."""
     rays = _rays(camera)
-    met = _meet(gaussians, camera, rays, choices)
+    hits = _intersect(gaussians, camera, rays, choices)
     colors = _colors(gaussians, camera, rays, choices)
     opacity = gaussians.opacities.double().numpy()
-    alphas = opacity * np.exp(-met.powers)
+    alphas = opacity * np.exp(-hits.powers)
     if choices.our_limits:
         alphas = np.where(alphas < ALPHA_MIN, 0.0, np.minimum(alphas, ALPHA_MAX))
     else:
-        alphas = np.where(met.missed, 0.0, np.minimum(alphas, _TRACED_ALPHA_MAX))
-    order = np.argsort(met.order, axis=1, kind="stable")
+        alphas = np.where(hits.missed, 0.0, np.minimum(alphas, _TRACED_ALPHA_MAX))
+    order = np.argsort(hits.order, axis=1, kind="stable")
     alphas = np.take_along_axis(alphas, order, 1)
-    through = np.cumprod(1 - alphas, axis=1)
-    before = np.concatenate([np.ones((len(through), 1)), through[:, :-1]], 1)
+    transmittance = np.cumprod(1 - alphas, axis=1)
+    before = np.concatenate([np.ones((len(transmittance), 1)), transmittance[:, :-1]], 1)
     # Ours leaves out the fragment that would end the pixel; theirs ends after it.
-    going_on = through > TRANSMITTANCE_MIN if choices.our_limits else before > TRACED_STOP
-    weights = before * alphas * going_on
+    contributes = transmittance > TRANSMITTANCE_MIN if choices.our_limits else before > TRACED_STOP
+    weights = before * alphas * contributes
     if colors.ndim == 2:
         image = np.einsum("pn,pnc->pc", weights, colors[order])
     else:
         image = np.einsum("pn,pnc->pc", weights, np.take_along_axis(colors, order[..., None], 1))
-    found = np.concatenate([image, weights.sum(1, keepdims=True)], 1)
-    return found.reshape(camera.height, camera.width, 4)
+    rgba = np.concatenate([image, weights.sum(1, keepdims=True)], 1)
+    return rgba.reshape(camera.height, camera.width, 4)
 
 
 def _rays(camera: Camera) -> Float[np.ndarray, "p 3"]:
@@ -105,7 +105,9 @@ def _rays(camera: Camera) -> Float[np.ndarray, "p 3"]:
     return directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
-def _meet(gaussians: Gaussians, camera: Camera, rays: Float[np.ndarray, "p 3"], choices: Choices) -> _Met:
+def _intersect(
+    gaussians: Gaussians, camera: Camera, rays: Float[np.ndarray, "p 3"], choices: Choices
+) -> _Intersections:
     axes = matrix_from_quaternion(gaussians.rotations.double()).numpy()
     scales, means = gaussians.scales.double().numpy(), gaussians.means.double().numpy()
     origin = camera.center.double().numpy()
@@ -118,13 +120,13 @@ def _meet(gaussians: Gaussians, camera: Camera, rays: Float[np.ndarray, "p 3"], 
     missed = distance > EXTENT**2
     local = means @ camera.T_camera_world[:3, :3].double().numpy().T
     local += camera.T_camera_world[:3, 3].double().numpy()
-    if choices.splats:
+    if choices.ewa_projection:
         powers = _splat_powers(camera, local, axes * scales[:, None], 0.0 if not choices.low_pass else EPS_2D)
     else:
         powers = distance / 2
     entry = nearest - np.sqrt(np.maximum(EXTENT**2 - distance, 0) / length)
     order = np.broadcast_to(local[:, 2], powers.shape) if choices.order_of_centers else entry
-    return _Met(powers, order, missed)
+    return _Intersections(powers, order, missed)
 
 
 def _splat_powers(
@@ -140,8 +142,8 @@ def _splat_powers(
         low, high = ((edge - K[axis, 2]) / K[axis, axis] for edge in (-margin, size + margin))
         J[:, axis, axis] = K[axis, axis] / z
         J[:, axis, 2] = -K[axis, axis] * np.clip(tangent, low, high) / z
-    spread = J @ (camera.T_camera_world[:3, :3].double().numpy() @ axes)
-    covariance = spread @ spread.transpose(0, 2, 1) + low_pass * np.eye(2)
+    projected_axes = J @ (camera.T_camera_world[:3, :3].double().numpy() @ axes)
+    covariance = projected_axes @ projected_axes.transpose(0, 2, 1) + low_pass * np.eye(2)
     centers = np.stack([K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]], -1)
     rows, columns = np.mgrid[: camera.height, : camera.width] + 0.5
     offsets = np.stack([columns.ravel(), rows.ravel()], -1)[:, None] - centers

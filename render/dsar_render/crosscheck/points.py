@@ -25,7 +25,7 @@ _RADIUS_PX, _RADIUS = 3.0, 1 / 64
 _DEPTHS_M = (1.0, 8.0)
 _MOST_PIXELS = 1024
 """Of the longer side of an image that is rendered; larger cameras are looked through at this size."""
-_SEEN = 0.5
+_MIN_VISIBLE = 0.5
 """Share of a sphere's area that must be in the image for its middle to count."""
 
 Projection = Callable[[Float[Tensor, "n 3"]], Float[Tensor, "n 2"]]
@@ -107,7 +107,7 @@ def project_spheres(mi: Any, camera: Camera, seed: int = 0) -> SphereObservation
     image = _render(mi, square, centers, radii)
     pixels = _centroids(image, len(centers), _apparent_area(square, centers, radii))
     size = torch.tensor([view.width / camera.width, taller * view.height / camera.height])
-    return SphereObservations(_apparent(view, centers, radii), pixels / size)
+    return SphereObservations(_centers_of_images(view, centers, radii), pixels / size)
 
 
 def _render(
@@ -141,12 +141,12 @@ def _centroids(
     places = torch.stack([columns.flatten(), rows.flatten()], -1).double()
     lit = light > 0
     which = (green[lit] / light[lit] * (count + 1)).round().long() - 1
-    known = (which >= 0) & (which < count)
-    which, weights, places = which[known], light[lit][known], places[lit][known]
+    valid = (which >= 0) & (which < count)
+    which, weights, places = which[valid], light[lit][valid], places[lit][valid]
     total = torch.zeros(count, dtype=torch.float64).index_add_(0, which, weights)
     sums = torch.zeros(count, 2, dtype=torch.float64).index_add_(0, which, weights[:, None] * places)
     centroids = sums / total[:, None]
-    centroids[total < _SEEN * areas] = torch.inf
+    centroids[total < _MIN_VISIBLE * areas] = torch.inf
     return centroids
 
 
@@ -155,7 +155,7 @@ def _in_camera(camera: Camera, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n
     return points @ transform[:3, :3].T + transform[:3, 3]
 
 
-def _apparent(
+def _centers_of_images(
     camera: Camera, centers: Float[Tensor, "n 3"], radii: Float[Tensor, " n"]
 ) -> Float[Tensor, "n 3"]:
     """Return the world points that fall on the centroids of the spheres' images."""

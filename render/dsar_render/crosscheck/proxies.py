@@ -35,7 +35,7 @@ class Shape:
 
 @dataclass(frozen=True)
 class Hits:
-    """What the centres of pixels see of some shapes."""
+    """What the centres of pixels see of shapes."""
 
     shapes: Int64[Tensor, "h w"]
     """Which shape; -1 where there is none."""
@@ -78,14 +78,14 @@ def ellipsoids(gaussians: Gaussians) -> Shape:
     return Shape("gaussians", vertices.flatten(0, 1), (faces + first[:, None, None]).flatten(0, 1))
 
 
-def see(shapes: Sequence[Shape], camera: Camera) -> Hits:
+def rasterize_shapes(shapes: Sequence[Shape], camera: Camera) -> Hits:
     """Return what a camera sees by our own projection."""
     firsts = np.cumsum([0, *(len(shape.vertices) for shape in shapes)])
     faces = torch.cat([shape.faces + int(first) for shape, first in zip(shapes, firsts, strict=False)])
     view = rasterize_mesh(torch.cat([shape.vertices for shape in shapes]), faces, camera)
     owner = torch.cat([torch.full((len(shape.faces),), index) for index, shape in enumerate(shapes)])
-    found = torch.where(view.faces >= 0, owner[view.faces.clamp_min(0)], -1)
-    return Hits(found, view.depth)
+    indices = torch.where(view.faces >= 0, owner[view.faces.clamp_min(0)], -1)
+    return Hits(indices, view.depth)
 
 
 class MitsubaScene:
@@ -98,36 +98,36 @@ class MitsubaScene:
             {"type": "scene"} | {shape.name: mesh for shape, mesh in zip(shapes, self._shapes, strict=True)}
         )
 
-    def see(self, camera: Camera) -> Hits:
+    def trace(self, camera: Camera) -> Hits:
         """Return what Mitsuba sees through a camera."""
         sensor = self._mi.load_dict(make_sensor(self._mi, square_pixels(camera)[0]))
-        look = self._look_one_by_one if self._mi.variant().startswith("scalar") else self._look
-        points, shapes = look(sensor, pixel_centers(camera))
+        intersect = self._intersect_scalar if self._mi.variant().startswith("scalar") else self._intersect
+        points, shapes = intersect(sensor, pixel_centers(camera))
         transform = camera.T_camera_world.double().numpy()
         depth = points @ transform[2, :3] + transform[2, 3]
         size = camera.height, camera.width
         depth[shapes < 0] = np.inf
         return Hits(torch.from_numpy(shapes).view(size), torch.from_numpy(depth).float().view(size))
 
-    def _look(self, sensor: Any, film: Float[np.ndarray, "p 2"]) -> tuple[np.ndarray, np.ndarray]:
+    def _intersect(self, sensor: Any, film: Float[np.ndarray, "p 2"]) -> tuple[np.ndarray, np.ndarray]:
         """Return where rays through places on the film end (world metres), and at which shape."""
         mi = self._mi
         x, y = (mi.Float(np.ascontiguousarray(film[:, axis], np.float32)) for axis in (0, 1))
         rays, _ = sensor.sample_ray(mi.Float(0), mi.Float(0), mi.Point2f(x, y), mi.Point2f(0.5))
-        found = self._scene.ray_intersect(rays)
+        hits = self._scene.ray_intersect(rays)
         shapes = np.full(len(film), -1)
         for index, mesh in enumerate(self._shapes):
-            shapes[np.array(found.shape == mi.ShapePtr(mesh))] = index
-        return np.array(found.p, np.float64).T, shapes
+            shapes[np.array(hits.shape == mi.ShapePtr(mesh))] = index
+        return np.array(hits.p, np.float64).T, shapes
 
-    def _look_one_by_one(self, sensor: Any, film: Float[np.ndarray, "p 2"]) -> tuple[np.ndarray, np.ndarray]:
+    def _intersect_scalar(self, sensor: Any, film: Float[np.ndarray, "p 2"]) -> tuple[np.ndarray, np.ndarray]:
         mi, middle = self._mi, self._mi.ScalarPoint2f(0.5)
         points, shapes = np.zeros((len(film), 3)), np.full(len(film), -1)
-        for index, place in enumerate(film.tolist()):
-            ray, _ = sensor.sample_ray(0.0, 0.0, mi.ScalarPoint2f(*place), middle)
-            found = self._scene.ray_intersect(ray)
-            if found.is_valid():
-                points[index], shapes[index] = np.array(found.p), self._shapes.index(found.shape)
+        for index, position in enumerate(film.tolist()):
+            ray, _ = sensor.sample_ray(0.0, 0.0, mi.ScalarPoint2f(*position), middle)
+            hit = self._scene.ray_intersect(ray)
+            if hit.is_valid():
+                points[index], shapes[index] = np.array(hit.p), self._shapes.index(hit.shape)
         return points, shapes
 
 

@@ -20,7 +20,7 @@ def write_crosscheck_report(verdict: Verdict, path: Path) -> Path:
     source = Path(__file__).with_name("report.html.jinja").read_text(encoding="utf-8")
     facts = {
         "verdict": verdict,
-        "what": {each.name: each.description for each in PROJECTION_FAULTS}
+        "descriptions": {fault.name: fault.description for fault in PROJECTION_FAULTS}
         | {"unknown": "none of the usual mistakes"},
         "steps": STEPS,
         "pictures": {name: [_embedded(image) for image in row] for name, row in verdict.pictures.items()},

@@ -54,7 +54,7 @@ class GaussianScene:
         self._integrator = mi.load_dict(
             {"type": "volprim_rf_basic", "srgb_primitives": False, "max_depth": _MAX_DEPTH}
         )
-        self.scene = mi.load_dict({"type": "scene", "gaussians": _shape(mi, gaussians)})
+        self.scene = mi.load_dict({"type": "scene", "gaussians": _ellipsoid_mesh(mi, gaussians)})
         self.parameters = mi.traverse(self.scene)
 
     def trace(self, camera: Camera) -> Float[Tensor, "h w 3"]:
@@ -87,7 +87,7 @@ class GaussianScene:
     def rays(self, camera: Camera) -> tuple[Any, Any]:
         """Return a sampler, which tracing has no use for, and the rays through the pixels' centres."""
         mi = self._mi
-        larger = dataclasses.replace(camera, T_camera_world=_enlarged(camera.T_camera_world))
+        larger = dataclasses.replace(camera, T_camera_world=_scale_translation(camera.T_camera_world))
         sensor = mi.load_dict(make_sensor(mi, square_pixels(larger)[0], unit=_SCALE))
         film = pixel_centers(larger).astype(np.float32)
         x, y = (mi.Float(np.ascontiguousarray(film[:, axis])) for axis in (0, 1))
@@ -97,7 +97,7 @@ class GaussianScene:
         return sampler, rays
 
 
-def white(gaussians: Gaussians) -> Gaussians:
+def whiten(gaussians: Gaussians) -> Gaussians:
     """Return Gaussians that are white from all sides: their image is their coverage."""
     harmonics = torch.zeros_like(gaussians.harmonics)
     harmonics[:, 0] = _WHITE
@@ -117,11 +117,11 @@ def closeup(gaussians: Gaussians, camera: Camera, size: int, pixels: float) -> C
     """
     places, depth = project(camera, gaussians.means)
     borders = torch.tensor([camera.width, camera.height])
-    seen = (depth > 0) & ((places > 0) & (places < borders)).all(-1)
-    if not seen.any():
+    visible = (depth > 0) & ((places > 0) & (places < borders)).all(-1)
+    if not visible.any():
         return None
-    places, depth = places[seen], depth[seen]
-    extent = _focal(camera) * gaussians.scales[seen].amax(-1) / depth
+    places, depth = places[visible], depth[visible]
+    extent = _focal(camera) * gaussians.scales[visible].amax(-1) / depth
     zoom = pixels / float(extent.median())
     near = camera.resized(math.ceil(camera.width * zoom), math.ceil(camera.height * zoom))
     # About the one that is nearest to the middle of all, which may itself lie in a gap.
@@ -142,16 +142,16 @@ def visible_from(gaussians: Gaussians, camera: Camera) -> Gaussians:
 
 def explain(mi: Any, gaussians: Gaussians, camera: Camera) -> Explanation:
     """Return what lies between our image of a small scene and Mitsuba's, one difference at a time."""
-    few = visible_from(gaussians, camera)
-    found = blend(few, camera, OURS)[..., :3]
-    ours = np.abs(found - rasterize(few, camera).color.double().numpy()).mean()
+    visible = visible_from(gaussians, camera)
+    image = blend(visible, camera, OURS)[..., :3]
+    ours = np.abs(image - rasterize(visible, camera).color.double().numpy()).mean()
     steps = []
     for step in STEPS:
-        changed = blend(few, camera, step.choices)[..., :3]
-        change = float(np.abs(changed - found).mean())
-        steps.append(StepEffect(step.name, change, psnr(changed, found)))
-        found = changed
-    theirs = np.abs(found - GaussianScene(mi, few).trace(camera).double().numpy()).mean()
+        changed = blend(visible, camera, step.choices)[..., :3]
+        change = float(np.abs(changed - image).mean())
+        steps.append(StepEffect(step.name, change, psnr(changed, image)))
+        image = changed
+    theirs = np.abs(image - GaussianScene(mi, visible).trace(camera).double().numpy()).mean()
     return Explanation(float(ours), tuple(steps), float(theirs))
 
 
@@ -190,15 +190,15 @@ def gradients(
         dr.enable_grad(scene.parameters[name])
     scene.parameters.update()
     scene.backpropagate(camera, weights)
-    found = {}
+    pairs = {}
     for name, theirs in names.items():
         ours = getattr(leaves, name).grad
         values = torch.from_numpy(np.array(dr.grad(scene.parameters[theirs]))).view(len(gaussians), -1)
         if name == "means":
             # By centres of the scene that is larger.
             values = values[:, :3] * _SCALE
-        found[name] = ours, values.reshape(ours.shape)
-    return found
+        pairs[name] = ours, values.reshape(ours.shape)
+    return pairs
 
 
 def correlation_and_slope(ours: Float[Tensor, "..."], theirs: Float[Tensor, "..."]) -> tuple[float, float]:
@@ -212,13 +212,13 @@ def _focal(camera: Camera) -> float:
     return float(camera.K.diagonal()[:2].max())
 
 
-def _enlarged(transform: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
+def _scale_translation(transform: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
     larger = transform.clone()
     larger[:3, 3] *= _SCALE
     return larger
 
 
-def _shape(mi: Any, gaussians: Gaussians) -> dict[str, Any]:
+def _ellipsoid_mesh(mi: Any, gaussians: Gaussians) -> dict[str, Any]:
     def tensor(values: Tensor) -> Any:
         return mi.TensorXf(values.detach().contiguous().float().numpy())
 

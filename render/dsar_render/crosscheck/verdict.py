@@ -34,7 +34,7 @@ class CameraVerdict:
     proxy: Agreement
 
     @property
-    def sees(self) -> bool:
+    def sees_proxy(self) -> bool:
         """Whether there is anything of the proxy geometry to compare."""
         return not math.isnan(self.proxy.iou)
 
@@ -43,7 +43,7 @@ class CameraVerdict:
         """What is wrong with the proxy geometry. What is not a number is wrong."""
         proxy = self.proxy
         same = proxy.iou >= _LEAST_IOU and proxy.depth_mae <= _MOST_DEPTH_M and proxy.shapes >= _LEAST_IOU
-        if same or not self.sees:
+        if same or not self.sees_proxy:
             return []
         return [
             f"{self.name}: proxy geometry differs: IoU {proxy.iou:.3f}, depths by "
@@ -67,18 +67,18 @@ class SplatVerdict:
     @property
     def faults(self) -> list[str]:
         """What is wrong. What is not a number is wrong."""
-        found = []
+        faults = []
         if not self.coverage <= _MOST_COVERAGE:
-            found.append(f"splats cover {self.coverage:.2%} of the image otherwise")
-        for camera, each in self.explanations.items():
-            if not each.ours <= _MOST_OF_OURS:
-                found.append(f"{camera}: our splats are {each.ours:.4f} from their definition")
-            if not each.theirs <= _MOST_OF_THEIRS:
-                found.append(f"{camera}: splats differ by {each.theirs:.4f} that nothing explains")
+            faults.append(f"splats cover {self.coverage:.2%} of the image otherwise")
+        for camera, explanation in self.explanations.items():
+            if not explanation.ours <= _MOST_OF_OURS:
+                faults.append(f"{camera}: our splats are {explanation.ours:.4f} from their definition")
+            if not explanation.theirs <= _MOST_OF_THEIRS:
+                faults.append(f"{camera}: splats differ by {explanation.theirs:.4f} that nothing explains")
         for name, (correlation, _) in self.gradients.items():
             if not correlation >= _LEAST_CORRELATION:
-                found.append(f"gradients by {name} correlate by {correlation:.2f} only")
-        return found
+                faults.append(f"gradients by {name} correlate by {correlation:.2f} only")
+        return faults
 
 
 @dataclass(frozen=True)
@@ -104,51 +104,75 @@ class Verdict:
     @property
     def faults(self) -> list[str]:
         """What is wrong, a line each."""
-        found = [
+        faults = [
             f"{camera.name}, {source}: {fault}"
             for camera in self.cameras
             for source, fault in camera.mistakes.items()
         ]
-        found += [fault for camera in self.cameras for fault in camera.faults]
-        if not any(camera.sees for camera in self.cameras):
-            found.append("no camera sees the body, so no silhouette and no depth was compared")
-        return found + (self.splats.faults if self.splats else [])
+        faults += [fault for camera in self.cameras for fault in camera.faults]
+        if not any(camera.sees_proxy for camera in self.cameras):
+            faults.append("no camera sees the body, so no silhouette and no depth was compared")
+        return faults + (self.splats.faults if self.splats else [])
 
     @property
     def caught(self) -> list[str]:
         """The seeded mistakes that were found and named."""
-        return [name for name, found in self.seeds.items() if found == name]
+        return [name for name, diagnosis in self.seeds.items() if diagnosis == name]
+
+    @property
+    def figures(self) -> "Figures":
+        """The figures, as `dsar crosscheck --json` writes them."""
+        residuals = [value for camera in self.cameras for value in camera.residuals.values()]
+        return Figures(
+            camera_px_rms=max(value.rms for value in residuals),
+            camera_px_max=max(value.max for value in residuals),
+            silhouette_iou=min(_numbers(camera.proxy.iou for camera in self.cameras)),
+            depth_mae_m=max(_numbers(camera.proxy.depth_mae for camera in self.cameras)),
+            splat_psnr=self.splats.psnr if self.splats else None,
+            seeded_wrong_cameras_caught=self.caught,
+            passed=self.passed,
+            variant=self.variant,
+            cameras={camera.name: camera for camera in self.cameras},
+            seeds=dict(self.seeds),
+            splats=self.splats,
+            faults=self.faults,
+            skipped=dict(self.skipped),
+        )
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What `dsar crosscheck --json` writes: names and order of its keys."""
+
+    camera_px_rms: float
+    """Of all projections of the worst camera, pixels."""
+    camera_px_max: float
+    silhouette_iou: float
+    depth_mae_m: float
+    splat_psnr: float | None
+    seeded_wrong_cameras_caught: list[str]
+    passed: bool
+    variant: str
+    cameras: dict[str, CameraVerdict]
+    seeds: dict[str, str | None]
+    splats: SplatVerdict | None
+    faults: list[str]
+    skipped: dict[str, str]
 
     def to_json(self) -> dict[str, Any]:
         """Return the figures; null where something was not checked, with the reason under `skipped`."""
-        every = [each for camera in self.cameras for each in camera.residuals.values()]
-        figures = {
-            "camera_px_rms": max(each.rms for each in every),
-            "camera_px_max": max(each.max for each in every),
-            "silhouette_iou": min(_known(camera.proxy.iou for camera in self.cameras)),
-            "depth_mae_m": max(_known(camera.proxy.depth_mae for camera in self.cameras)),
-            "splat_psnr": self.splats.psnr if self.splats else None,
-            "seeded_wrong_cameras_caught": self.caught,
-            "passed": self.passed,
-            "variant": self.variant,
-            "cameras": {each.name: dataclasses.asdict(each) for each in self.cameras},
-            "seeds": dict(self.seeds),
-            "splats": dataclasses.asdict(self.splats) if self.splats else None,
-            "faults": self.faults,
-            "skipped": dict(self.skipped),
-        }
-        return _writable(figures)
+        return _without_infinities(dataclasses.asdict(self))
 
 
-def _known(values: Iterable[float]) -> list[float]:
+def _numbers(values: Iterable[float]) -> list[float]:
     """Return the values that are numbers; if none is, one that is not."""
     return [value for value in values if not math.isnan(value)] or [math.nan]
 
 
-def _writable(value: Any) -> Any:
+def _without_infinities(value: Any) -> Any:
     """Return the same with null for what is not finite, which JSON has no word for."""
     if isinstance(value, dict):
-        return {key: _writable(each) for key, each in value.items()}
+        return {key: _without_infinities(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_writable(each) for each in value]
+        return [_without_infinities(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value

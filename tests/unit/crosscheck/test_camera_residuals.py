@@ -12,7 +12,7 @@ from dsar.errors import ConfigError
 from dsar.geometry.camera_faults import PROJECTION_FAULTS, explain_projection
 from dsar.geometry.cameras import project
 from dsar_exporters import read_back_projections, write_usd
-from dsar_exporters.projections import _speck as speck
+from dsar_exporters.projections import _single_gaussian as speck
 from dsar_exporters.usd import read_usd_projections
 from dsar_render.crosscheck.comparison import TOLERANCE_PX, find_fault, seed_mistakes
 from dsar_render.crosscheck.points import (

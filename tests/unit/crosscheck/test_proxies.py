@@ -8,7 +8,7 @@ import torch
 from dsar.body.files import load_body
 from dsar.geometry.cameras import project
 from dsar.types import Camera, Gaussians
-from dsar_render.crosscheck.proxies import Hits, MitsubaScene, Shape, compare, ellipsoids, see
+from dsar_render.crosscheck.proxies import Hits, MitsubaScene, Shape, compare, ellipsoids, rasterize_shapes
 
 
 def shapes(cloud: Gaussians) -> list[Shape]:
@@ -20,7 +20,7 @@ def shapes(cloud: Gaussians) -> list[Shape]:
 def test_both_see_the_same_silhouettes_depths_and_shapes(request, variant, oblong, cloud):
     mi = request.getfixturevalue(variant)
     made = shapes(cloud)
-    found = compare(see(made, oblong), MitsubaScene(mi, made).see(oblong))
+    found = compare(rasterize_shapes(made, oblong), MitsubaScene(mi, made).trace(oblong))
     assert found.iou > 0.999
     assert found.depth_mae < 1e-4
     assert found.shapes > 0.999
@@ -30,7 +30,8 @@ def test_a_shift_of_a_pixel_shows(scalar, oblong, cloud):
     made = shapes(cloud)
     shifted = oblong.cropped(1, 0, oblong.width, oblong.height)
     right, wrong = (
-        compare(see(made, each), MitsubaScene(scalar, made).see(oblong)) for each in (oblong, shifted)
+        compare(rasterize_shapes(made, each), MitsubaScene(scalar, made).trace(oblong))
+        for each in (oblong, shifted)
     )
     assert wrong.iou < 0.99 < right.iou
     assert wrong.depth_mae > 10 * right.depth_mae
@@ -68,6 +69,6 @@ def test_depth_is_along_the_cameras_axis(scalar, oblong: Camera):
     T = oblong.T_camera_world
     plane = Shape("plane", (corners - T[:3, 3]) @ T[:3, :3], torch.tensor([[0, 1, 2], [0, 2, 3]]))
     torch.testing.assert_close(project(oblong, plane.vertices)[1], torch.full((4,), 2.0))
-    seen = MitsubaScene(scalar, [plane]).see(oblong)
+    seen = MitsubaScene(scalar, [plane]).trace(oblong)
     assert seen.hit.all()
     torch.testing.assert_close(seen.depth, torch.full_like(seen.depth, 2.0), atol=1e-5, rtol=0)

@@ -19,7 +19,7 @@ from dsar_render.crosscheck.splats import (
     gradients,
     psnr,
     visible_from,
-    white,
+    whiten,
 )
 
 
@@ -38,7 +38,7 @@ def test_the_definition_by_our_choices_is_our_rasteriser(cloud, small):
 def test_the_definition_by_the_tracers_choices_is_mitsuba(llvm, cloud, small):
     found = blend(cloud, small, STEPS[-1].choices)
     light = GaussianScene(llvm, cloud).trace(small).numpy()
-    coverage = GaussianScene(llvm, white(cloud)).trace(small).numpy()[..., 0]
+    coverage = GaussianScene(llvm, whiten(cloud)).trace(small).numpy()[..., 0]
     assert np.abs(found[..., :3] - light).mean() < 2e-3
     assert np.abs(found[..., 3] - coverage).mean() < 2e-3
 
@@ -97,7 +97,7 @@ def test_coverage_and_colours_agree_where_splats_are_some_pixels_large(llvm, clo
     few = visible_from(cloud, view)
     ours = rasterize(few, view)
     theirs = GaussianScene(llvm, few).trace(view)
-    covered = GaussianScene(llvm, white(few)).trace(view)[..., 0]
+    covered = GaussianScene(llvm, whiten(few)).trace(view)[..., 0]
     assert coverage_difference(ours.alpha, covered) < 0.005
     assert psnr(ours.color.numpy(), theirs.numpy()) > 30
 

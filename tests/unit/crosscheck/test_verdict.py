@@ -66,7 +66,7 @@ def test_a_seed_that_is_missed_fails_without_a_fault():
 
 
 def test_figures_leave_out_cameras_that_see_nothing():
-    figures = verdict(camera(), dataclasses.replace(camera(UNSEEN), name="cam1")).to_json()
+    figures = verdict(camera(), dataclasses.replace(camera(UNSEEN), name="cam1")).figures.to_json()
     assert figures["passed"]
     assert figures["silhouette_iou"] == 0.999
     assert figures["cameras"]["cam1"]["proxy"]["iou"] is None

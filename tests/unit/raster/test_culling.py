@@ -18,7 +18,8 @@ from raster_scenes import (
 )
 
 from dsar.errors import CaptureError, ConfigError, RasterError
-from dsar.raster import _check_outputs, cpu, rasterize
+from dsar.raster import cpu, rasterize
+from dsar.raster.checks import check_outputs
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -75,6 +76,6 @@ def test_inputs_that_do_not_fit_are_refused():
         ConfigError,
         match="outputs can be median_depth, first_hit_depth, largest_weight_id, contributors; found normals",
     ):
-        _check_outputs(["normals"])
+        check_outputs(["normals"])
     with pytest.raises(ConfigError, match="float32 tensors on a GPU, not"):
         rasterize(gaussians, camera, backend="cuda")

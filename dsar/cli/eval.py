@@ -1,13 +1,13 @@
-"""`dsar eval` and `dsar stress`."""
+"""`dsar eval`."""
 
 import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from dsar.cli.command import RunCommand, resolve_sequence
+from dsar.cli.command import RunCommand
 from dsar.cli.previews import write_worst
-from dsar.console import ProgressBar, track_progress
+from dsar.console import ProgressBar
 
 
 @dataclass(frozen=True)
@@ -74,8 +74,8 @@ class Eval(RunCommand):
         summary = summarize_tables(study, tables)
         facts = {"complete": complete, "minutes": self.minutes, "capture": capture}
         self.write_json(facts | {"tables": summary})
-        found = facts | {"tables": summarize_tables(study, every)}
-        write_text_atomically(self.study / "study.json", json.dumps(found, indent=1) + "\n")
+        content = facts | {"tables": summarize_tables(study, every)}
+        write_text_atomically(self.study / "study.json", json.dumps(content, indent=1) + "\n")
         sys.stdout.write(to_markdown(summary))
         if not complete:
             sys.stdout.write("\nNot complete: the same command goes on with what is missing.\n")
@@ -95,48 +95,15 @@ class Eval(RunCommand):
         run = Run(self.chosen_run())
         avatar, config, _ = load_checkpoint(run)
         figures = evaluate(avatar, open_images(run, config))
-        self.write_json(figures)
-        write_worst(run.folder, figures["worst"])
-        write_text_atomically(run.figures, json.dumps(figures, indent=2) + "\n")
+        content = figures.to_json()
+        self.write_json(content)
+        write_worst(run.folder, figures.worst)
+        write_text_atomically(run.figures, json.dumps(content, indent=2) + "\n")
         write_report(run)
-        for split, values in figures["splits"].items():
-            if values is not None:
+        for split, metrics in content["splits"].items():
+            if metrics is not None:
                 keys = ("psnr", "psnr_box", "psnr_box_template", "ssim")
                 sys.stdout.write(
-                    f"{split:6s} " + "  ".join(f"{key} {values[key]:.3f}" for key in keys) + "\n"
+                    f"{split:6s} " + "  ".join(f"{key} {metrics[key]:.3f}" for key in keys) + "\n"
                 )
-        sys.stdout.write(f"one-to-many {figures['one_to_many']}\n")
-
-
-@dataclass(frozen=True)
-class Stress(RunCommand):
-    """Drive an avatar where rollouts fail."""
-
-    def output_folders(self) -> list[Path]:
-        """Return the run, which keeps its verdicts and report."""
-        return [self.chosen_run()]
-
-    def run(self) -> None:
-        """Run the battery on the held-out motion that is furthest from training; print each verdict."""
-        from dsar.atomic_files import write_text_atomically
-        from dsar.evaluation.report import write_report
-        from dsar.evaluation.stress import CASES, stress
-        from dsar.training.checkpoint import Run, load_checkpoint
-        from dsar.training.scene import open_scene
-
-        self.check_device()
-        run = Run(self.chosen_run())
-        avatar, config, _ = load_checkpoint(run)
-        scene = open_scene(run, config)
-        verdicts = stress(avatar, scene.motions[resolve_sequence(scene, "test") or ""], CASES)
-        found = {}
-        for name, verdict in track_progress(verdicts, len(CASES), self.progress, "stress"):
-            found[name] = verdict.to_json()
-            outcome = "passed" if verdict.passed else "FAILED"
-            sys.stdout.write(f"{name:9s} {outcome}  {verdict.describe()}\n")
-        survived = sum(case["pass"] for case in found.values())
-        sys.stdout.write(f"{survived} of {len(found)} passed\n")
-        battery = {"cases": found, "survived": survived, "tried": len(found)}
-        self.write_json(battery)
-        write_text_atomically(run.stress, json.dumps(battery, indent=2) + "\n")
-        write_report(run)
+        sys.stdout.write(f"one-to-many {content['one_to_many']}\n")

@@ -1,0 +1,79 @@
+"""What a rasteriser asks of its input before it draws."""
+
+import math
+from collections.abc import Collection
+
+from torch import Tensor
+
+from dsar.errors import CaptureError, ConfigError
+from dsar.raster.backends import OUTPUTS
+from dsar.types import Camera, Gaussians
+
+
+def check_inputs(
+    gaussians: Gaussians,
+    camera: Camera,
+    background: Tensor | None,
+    dilation: float,
+    outputs: Collection[str],
+) -> None:
+    """Check the arguments of `dsar.raster.rasterize`.
+
+    Raises:
+        ConfigError: The tensors do not fit each other, or a setting is not usable.
+        CaptureError: The camera has skew, no positive focal length, no pixels, or values that are not finite.
+    """
+    _check_camera(camera)
+    _check_tensors(gaussians, background)
+    check_outputs(outputs)
+    if not 0 < dilation < math.inf:
+        raise ConfigError(f"rasterize: dilation must be positive and finite (pixels²), found {dilation}")
+
+
+def _check_camera(camera: Camera) -> None:
+    """Raise CaptureError where a camera is not a plain pinhole."""
+    (fx, skew, _), (shear, fy, _), bottom = camera.K.tolist()
+    if skew != 0 or shear != 0 or bottom != [0, 0, 1] or not (fx > 0 and fy > 0):
+        raise CaptureError(
+            f"camera {camera.name!r}: K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0, found "
+            f"{camera.K.tolist()}; undistort and rectify the images first"
+        )
+    if not (camera.K.isfinite().all() and camera.T_camera_world.isfinite().all()):
+        raise CaptureError(f"camera {camera.name!r}: K or T_camera_world holds values that are not finite")
+    if camera.width < 1 or camera.height < 1:
+        raise CaptureError(f"camera {camera.name!r}: its image has {camera.width} x {camera.height} pixels")
+
+
+def check_outputs(outputs: Collection[str]) -> None:
+    """Check that outputs exist.
+
+    Raises:
+        ConfigError: One does not.
+    """
+    unknown = sorted(set(outputs) - set(OUTPUTS))
+    if unknown:
+        raise ConfigError(f"rasterize: outputs can be {', '.join(OUTPUTS)}; found {', '.join(unknown)}")
+
+
+def _check_tensors(gaussians: Gaussians, background: Tensor | None) -> None:
+    """Raise ConfigError where tensors do not belong together."""
+    n, count = len(gaussians), gaussians.harmonics.shape[1]
+    if count not in (1, 4, 9, 16):
+        raise ConfigError(
+            f"rasterize: harmonics come in 1, 4, 9 or 16 coefficients (degree 0-3), not {count}"
+        )
+    shapes = {
+        "means": (n, 3), "rotations": (n, 4), "scales": (n, 3), "opacities": (n,), "harmonics": (n, count, 3),
+        "background": (3,),
+    }  # fmt: skip
+    means, tensors = gaussians.means, {**vars(gaussians), "background": background}
+    for name, tensor in tensors.items():
+        if tensor is None:
+            continue
+        if tensor.shape != shapes[name]:
+            raise ConfigError(f"rasterize: {name} must be {shapes[name]}, found {tuple(tensor.shape)}")
+        if tensor.dtype != means.dtype or tensor.device != means.device:
+            raise ConfigError(
+                f"rasterize: tensors differ: {means.dtype} on {means.device} and {tensor.dtype} on "
+                f"{tensor.device}; bring all to one dtype and device"
+            )

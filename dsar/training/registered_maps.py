@@ -1,0 +1,121 @@
+"""The offset maps that registration fits to training frames, and that the network is pre-trained on."""
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from dsar.avatar.avatar import Avatar
+from dsar.config import TrainConfig
+from dsar.training import workers
+from dsar.training.rollouts import RolloutCursor
+from dsar.types import Capture
+
+LIMIT = 0.4
+"""Largest share of a budget of time; frames that are left by then stay without a map."""
+
+
+class RegisteredMaps:
+    """A map for each frame of each sequence, as far as they are fitted, and what fitting them took."""
+
+    def __init__(self, clips: Mapping[str, range], points: int, unseen: Mapping[str, frozenset[int]]) -> None:
+        """Begin with no map.
+
+        Args:
+            clips: Frames to register, by sequence; none where nothing is to be registered.
+            points: Number of control points.
+            unseen: Frames that no camera saw: their maps carry the cloth on and teach nothing.
+        """
+        self.clips, self.unseen = dict(clips), unseen
+        self.shares = divide_sequences(clips, workers.world_size())
+        """Sequences that each worker fits."""
+        self.offsets = {name: torch.zeros(clip.stop, points, 3) for name, clip in clips.items()}
+        """Offsets of the control points along their axes, metres, by frame."""
+        self.fitted = {name: torch.zeros((), dtype=torch.int64) for name in clips}
+        """Frames of each clip that have a map, counted from its first."""
+        self.count = 0
+        """Frames fitted by the busiest worker."""
+        self.budget_used = 0.0
+        """Share of the budget of time that was used."""
+
+    @classmethod
+    def begin(
+        cls, config: TrainConfig, capture: Capture, avatar: Avatar, clips: Mapping[str, range]
+    ) -> "RegisteredMaps":
+        """Return the maps of a run before the first is fitted; none without a garment or a use for them."""
+        used = bool(config.schedule.pretraining_fraction) and len(avatar.garment_control_points()) > 0
+        registered = clips if used else {}
+        unseen = {
+            name: frozenset(frame for frame in clip if not capture.cameras_with_image(name, frame))
+            for name, clip in registered.items()
+        }
+        return cls(registered, len(avatar.control.cells), unseen)
+
+    @property
+    def longest(self) -> int:
+        """Frames that the busiest worker fits."""
+        return max(sum(len(self.clips[name]) for name in share) for share in self.shares)
+
+    @property
+    def complete(self) -> bool:
+        """Whether every worker has fitted its frames, or time is up."""
+        return self.count >= self.longest or self.budget_used >= LIMIT
+
+    def has_map(self, sequence: str, frame: int) -> bool:
+        """Return whether a frame has a map that the network can learn from."""
+        if sequence not in self.clips:
+            return False
+        first = self.clips[sequence].start
+        fitted = range(first, first + int(self.fitted[sequence]))
+        return frame in fitted and frame not in self.unseen[sequence]
+
+    @property
+    def usable(self) -> bool:
+        """Whether any frame has a map that the network can learn from."""
+        return any(self.has_map(name, frame) for name, clip in self.clips.items() for frame in clip)
+
+    def targets(self, cursors: Sequence[RolloutCursor]) -> tuple[Float[Tensor, "b p 3"], Bool[Tensor, " b"]]:
+        """Return the map of the frame that each rollout sees, zeros without one, and which have one."""
+        has_map = [self.has_map(cursor.sequence, cursor.frame) for cursor in cursors]
+        points = next(iter(self.offsets.values())).shape[1:]
+        maps = [
+            self.offsets[cursor.sequence][cursor.frame] if has else torch.zeros(points)
+            for has, cursor in zip(has_map, cursors, strict=True)
+        ]
+        return torch.stack(maps), torch.tensor(has_map)
+
+    def schedule_speedup(self, template_fraction: float) -> float:
+        """Return the factor by which later stages advance faster than time, for what registration took."""
+        left = 1 - template_fraction
+        return left / (left - self.budget_used) if self.complete else 1.0
+
+    def all_gather(self) -> None:
+        """Give all workers what each has fitted."""
+        workers.all_reduce([*self.offsets.values(), *self.fitted.values()])
+        self.count = self.longest
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return the maps, and how far fitting them has come."""
+        tensors = {f"offsets.{name}": maps for name, maps in self.offsets.items()}
+        tensors |= {f"fitted.{name}": fitted for name, fitted in self.fitted.items()}
+        used = torch.tensor(self.budget_used, dtype=torch.float64)
+        return tensors | {"count": torch.tensor(self.count), "used": used}
+
+    def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
+        """Restore what `state_dict` returned.
+
+        Raises:
+            KeyError: a sequence is missing.
+        """
+        self.offsets = {name: tensors[f"offsets.{name}"] for name in self.offsets}
+        self.fitted = {name: tensors[f"fitted.{name}"] for name in self.fitted}
+        self.count, self.budget_used = int(tensors["count"]), float(tensors["used"])
+
+
+def divide_sequences(clips: Mapping[str, range], workers: int) -> list[list[str]]:
+    """Return which sequences each worker gets, so that none has much more to do than another."""
+    shares: list[list[str]] = [[] for _ in range(workers)]
+    for name in sorted(clips, key=lambda name: -len(clips[name])):
+        min(shares, key=lambda share: sum(len(clips[n]) for n in share)).append(name)
+    return shares

@@ -1,0 +1,44 @@
+"""The settings with which a run may go on: those it was begun with, but for its length and its places."""
+
+import dataclasses
+import logging
+
+from dsar.config import TrainConfig
+from dsar.data.captures.multiview import MultiViewCapture
+from dsar.errors import ConfigError
+from dsar.training.checkpoint import Run, read_config
+from dsar.training.scene import read_scene, scene_of_capture
+
+_log = logging.getLogger(__name__)
+
+
+def with_body(config: TrainConfig, capture: MultiViewCapture) -> TrainConfig:
+    """Return the settings with the body file that came from the environment written down."""
+    path = capture.body_path
+    if config.body is not None or path is None or path.resolve().is_relative_to(capture.root.resolve()):
+        return config
+    return dataclasses.replace(config, body=str(path.resolve()))
+
+
+def resumed_settings(run: Run, config: TrainConfig, capture: MultiViewCapture) -> TrainConfig:
+    """Return the settings of a run; with the capture that is given now, if it is the same, moved."""
+    saved = read_config(run)
+    if config.capture != saved.capture and run.scene.exists():
+        if not read_scene(run.scene).is_of(scene_of_capture(capture)):
+            return saved
+        _log.info("Run %s: its capture was %s and is %s now", run.folder, saved.capture, config.capture)
+        return dataclasses.replace(saved, capture=config.capture)
+    return saved
+
+
+def check_same_settings(config: TrainConfig, saved: TrainConfig, run: Run) -> None:
+    """Raise ConfigError where a resumed run would change a setting other than its length."""
+    length = {"steps": config.schedule.steps, "minutes": config.schedule.minutes}
+    saved = dataclasses.replace(saved, schedule=dataclasses.replace(saved.schedule, **length))
+    given, recorded = dataclasses.asdict(config), dataclasses.asdict(saved)
+    changed = sorted(key for key in given if given[key] != recorded[key])
+    if changed:
+        raise ConfigError(
+            f"--resume: {run.config} was made with other values of {', '.join(changed)}; repeat the command "
+            "that started the run, or start another with a new --out"
+        )
