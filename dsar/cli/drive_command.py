@@ -4,12 +4,13 @@ import hashlib
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from dsar.cli.command import RunCommand, resolve_sequence
 from dsar.errors import ConfigError, DsarError
+from dsar.geometry.camera_paths import START_FRAME
 from dsar.geometry.frame_numbers import parse_frames
 from dsar.geometry.frame_rates import exact_rate, parse_rate, same_rate
 from dsar.types import Body, Camera, GaussianSequence, Motion
@@ -39,6 +40,11 @@ class DrivenAvatar:
     def cameras(self) -> tuple[Camera, ...]:
         """Those of the capture; a DsarError where there is neither it nor what a run keeps of it."""
         return self.scene().cameras
+
+    @cached_property
+    def whole(self) -> GaussianSequence:
+        """The Gaussians of all frames that are delivered."""
+        return self.roll_out()
 
     def roll_out(self, frames: Sequence[int] | None = None) -> GaussianSequence:
         """Return the Gaussians of some frames, all by default."""
@@ -81,9 +87,8 @@ class DriveCommand(RunCommand):
 
     def open(self) -> DrivenAvatar:
         """Return the avatar and its motion."""
-        from dsar.data.motions.files import read_motion, resample
-        from dsar.data.motions.kinematics import trace_joints
-        from dsar.data.motions.plausibility import check_plausibility
+        from dsar.data.motions.files import resample
+        from dsar.data.motions.out_of_distribution import log_out_of_distribution
         from dsar.training.checkpoint import Run, load_checkpoint
         from dsar.training.scene import open_scene
 
@@ -91,26 +96,36 @@ class DriveCommand(RunCommand):
         fps = None if self.fps is None else parse_rate(self.fps)
         run, file = Run(self.chosen_run()), self.motion_file()
         avatar, config, provenance = load_checkpoint(run)
-        scene = cache(partial(open_scene, run, config))
+        scene, training = cache(partial(open_scene, run, config)), None
         if file is None:
             self._refuse_file_flags(self.motion)
             motion = _sequence(scene(), self.motion)
-            read = _hash(motion)
+            source_hash = _hash(motion)
         else:
-            rate = None if self.motion_fps is None else parse_rate(self.motion_fps, "--motion-fps")
-            motion = read_motion(file, avatar.body, up=self.up, fps=rate)
-            check_plausibility(trace_joints(avatar.body, motion))
-            read = _digest(file.read_bytes())
+            training = _training_motions(scene, file.stem)
+            motion = self._read_motion_file(file, avatar.body)
+            source_hash = _digest(file.read_bytes())
         provenance["motion_hash"] = _hash(motion)
         driven = delivered = resample(motion, avatar.fps)
         if fps is not None and not same_rate(fps, avatar.fps):
             delivered = resample(motion, fps)
             provenance["fps"] = str(exact_rate(fps))
-        if file is not None:
-            _compare_with_training(avatar.body, delivered, scene)
+        if training is not None:
+            log_out_of_distribution(avatar.body, delivered, training, START_FRAME)
         settings = _digest(repr(config.model).encode())
-        inputs = {"checkpoint": provenance["checkpoint"], "model": settings, "motion": read}
+        inputs = {"checkpoint": provenance["checkpoint"], "model": settings, "motion": source_hash}
         return DrivenAvatar(avatar, driven, delivered, scene, provenance, inputs)
+
+    def _read_motion_file(self, file: Path, body: Body) -> Motion:
+        """Return the motion of a file, and log what looks wrong with it."""
+        from dsar.data.motions.files import read_motion
+        from dsar.data.motions.kinematics import trace_joints
+        from dsar.data.motions.plausibility import check_plausibility
+
+        fps = None if self.motion_fps is None else parse_rate(self.motion_fps, "--motion-fps")
+        motion = read_motion(file, body, up=self.up, fps=fps)
+        check_plausibility(trace_joints(body, motion))
+        return motion
 
     def _refuse_file_flags(self, sequence: str) -> None:
         """Raise ConfigError where flags for motion files stand beside a sequence of the capture."""
@@ -132,22 +147,25 @@ def _sequence(scene: "Scene", motion: str) -> Motion:
     return scene.motions[name]
 
 
-def _compare_with_training(body: Body, motion: Motion, scene: "Callable[[], Scene]") -> None:
-    """Log how far a motion is from those of training, where these are known."""
-    from dsar.avatar.rollout import START_FRAME
-    from dsar.data.motions.out_of_distribution import log_out_of_distribution
+def _training_motions(scene: "Callable[[], Scene]", motion: str) -> list[Motion] | None:
+    """Return what an avatar was trained with; None, and say so, where that is not known.
 
+    Args:
+        scene: Opens what the run keeps of its capture.
+        motion: Name of the motion that is to be compared with it.
+    """
     try:
-        known = [scene().motions[trained] for trained in scene().splits["train"]]
+        return [scene().motions[name] for name in scene().splits["train"]]
     except DsarError as error:
-        LOGGER.warning("Motion %s: not compared with training's, which are not known: %s", motion.name, error)
-        return
-    log_out_of_distribution(body, motion, known, START_FRAME)
+        LOGGER.warning("Motion %s: not compared with training's, which are not known: %s", motion, error)
+        return None
 
 
 def _hash(motion: Motion) -> str:
     """Return a hash of the poses and their rate: a file may change and keep its name."""
-    values = [each.cpu().contiguous().numpy().tobytes() for each in (motion.rotations, motion.translations)]
+    values = [
+        tensor.cpu().contiguous().numpy().tobytes() for tensor in (motion.rotations, motion.translations)
+    ]
     return _digest(b"".join([repr(motion.fps).encode(), *values]))
 
 

@@ -1,8 +1,9 @@
 """`dsar export`."""
 
+import dataclasses
 import logging
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,6 +17,32 @@ if TYPE_CHECKING:
     from dsar_exporters import Output
 
 LOGGER = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class WritingCost:
+    """What an output took."""
+
+    files: int
+    bytes: int
+    seconds: float
+    """Spent in writing, without the rollout."""
+
+
+@dataclass(frozen=True)
+class ExportFacts:
+    """What was written; the fields are the keys of `dsar export --json`."""
+
+    motion: str
+    """Name of the motion."""
+    written: Mapping[str, str]
+    """Path by the name of the output's flag."""
+    cost: Mapping[str, WritingCost]
+    """By the same names."""
+    gaussians: int
+    frames: int
+    fps: float
+    """Frames per second of the frame numbers."""
 
 
 @dataclass(frozen=True)
@@ -73,13 +100,19 @@ class Export(DriveCommand):
         sequence = driven.roll_out(wanted)
         outputs = self.outputs(self.cameras(driven))
         delivered = export(with_progress(sequence, self.progress, "export"), list(outputs.values()))
-        facts = {"gaussians": sequence.num_gaussians, "frames": len(sequence), "fps": sequence.fps}
-        written = {name: str(output.path) for name, output in outputs.items()}
-        files = {
-            name: {"files": each.files, "bytes": each.size, "seconds": each.seconds}
-            for name, each in zip(outputs, delivered, strict=True)
-        }
-        self.write_json({"motion": driven.motion.name, "written": written, "cost": files, **facts})
+        deliveries = dict(zip(outputs, delivered, strict=True))
+        facts = ExportFacts(
+            motion=driven.motion.name,
+            written={name: str(output.path) for name, output in outputs.items()},
+            cost={
+                name: WritingCost(files=delivery.files, bytes=delivery.size, seconds=delivery.seconds)
+                for name, delivery in deliveries.items()
+            },
+            gaussians=sequence.num_gaussians,
+            frames=len(sequence),
+            fps=sequence.fps,
+        )
+        self.write_json(dataclasses.asdict(facts))
 
     def cameras(self, driven: DrivenAvatar) -> Sequence[Camera]:
         """Return the capture's cameras for formats that have cameras; none, and say so, if they are gone."""

@@ -130,9 +130,9 @@ class _Scene:
         numbers = [self.first + frame for frame in frames]
         motion = self.capture.motions[sequence]
         chosen = [self.capture.cameras[camera] for camera in cameras]
-        made = render_sequence(
+        rendered = render_sequence(
             roll_out(self.avatar, motion, frames=numbers), chosen, background=torch.ones(3)
         )
         index = {camera.name: number for number, camera in zip(cameras, chosen, strict=True)}
-        for number, camera, output in made:
+        for number, camera, output in rendered:
             yield number - self.first, index[camera.name], display_image(output)

@@ -4,19 +4,19 @@ import dataclasses
 import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from dsar.cli.camera_selection import CameraSelection
 from dsar.cli.drive_command import DriveCommand, DrivenAvatar
 from dsar.cli.expected_inputs import check_inputs, to_flag
 from dsar.config import EMBEDDED
 from dsar.console import track_progress
-from dsar.errors import CheckpointError, ConfigError
-from dsar.geometry.camera_files import cameras_to_json, list_cameras_json, read_cameras_json
-from dsar.geometry.camera_paths import DOLLY, ORBIT, TURNTABLE, CameraPath, dolly, orbit, turntable
+from dsar.errors import ConfigError
+from dsar.geometry.camera_files import cameras_to_json
+from dsar.geometry.camera_paths import CameraPath
 
 if TYPE_CHECKING:
     from dsar_exporters import ColorTarget
@@ -24,7 +24,20 @@ if TYPE_CHECKING:
     from dsar_render.writers import PictureWriter
 
 LOGGER = logging.getLogger(__name__)
-_MADE = {TURNTABLE: turntable, ORBIT: orbit, DOLLY: dolly}
+
+
+@dataclass(frozen=True)
+class RenderFacts:
+    """What was rendered; the fields are the keys of `dsar render --json`."""
+
+    motion: str
+    """Name of the motion."""
+    images: int
+    """Rendered now, over all cameras."""
+    skipped: int
+    """Images that were there already."""
+    cameras: Sequence[str]
+    """Names of the cameras."""
 
 
 @dataclass(frozen=True)
@@ -116,47 +129,46 @@ class Render(DriveCommand):
         settings = self.settings()
         writers = tuple(self.writers())
         driven = self.open()
-        whole = driven.roll_out()
-        frames = wanted or list(whole.frame_numbers)
+        frames = wanted or list(driven.whole.frame_numbers)
         driven.roll_out(frames)  # names frames that are not in the motion
-        paths = self.paths(driven, frames)
+        selection = self.selection(driven)
+        paths = selection.paths(frames)
+        self.check_together(paths)
         if self.expect is not None:
-            check_inputs(self.expect, self.inputs(driven))
+            check_inputs(self.expect, self.inputs(selection))
         shot = Shot(tuple(paths), writers, settings, previews=self.mp4 is not None)
         if self.openjd is not None:
-            self.write_template(self.openjd, driven, frames)
+            self.write_template(self.openjd, selection, frames)
             return
         rendered = self.render(driven, shot, frames)
-        self.write_json(
-            {
-                "motion": driven.motion.name,
-                "images": rendered * len(paths),
-                "skipped": (len(frames) - rendered) * len(paths),
-                "cameras": [path.name for path in paths],
-            }
+        facts = RenderFacts(
+            motion=driven.motion.name,
+            images=rendered * len(paths),
+            skipped=(len(frames) - rendered) * len(paths),
+            cameras=[path.name for path in paths],
         )
+        self.write_json(dataclasses.asdict(facts))
 
     def render(self, driven: DrivenAvatar, shot: "Shot", frames: Sequence[int]) -> int:
         """Render what is not there yet; return how many frames that was."""
         from dsar_render import add_neighbours, render_shot, write_mp4
 
-        whole = driven.roll_out()
-        facts = dict(whole.provenance)
+        facts = dict(driven.whole.provenance)
         # A video needs every frame.
         if self.skip_existing and self.mp4 is None:
             frames = [frame for frame in frames if not shot.is_complete(frame, facts)]
         if not frames:
             return 0
-        every = whole.frame_numbers
+        every = driven.whole.frame_numbers
         rolled = add_neighbours(frames, every[0], every[-1]) if shot.settings.needs_neighbours else frames
         sequence = driven.roll_out(rolled)
         done = render_shot(shot, sequence, frames, jobs=self.jobs, scheduler=self.scheduler)
-        with_progress = track_progress(done, len(frames), self.progress, "render")
+        progress = track_progress(done, len(frames), self.progress, "render")
         if self.mp4 is None:
-            for _ in with_progress:
+            for _ in progress:
                 pass
         else:
-            write_mp4((image for _, image in with_progress if image is not None), self.mp4, fps=sequence.fps)
+            write_mp4((image for _, image in progress if image is not None), self.mp4, fps=sequence.fps)
         return len(frames)
 
     def settings(self) -> "RenderSettings":
@@ -195,64 +207,9 @@ class Render(DriveCommand):
         absolute = config if config.startswith("ocio://") else str(Path(config).absolute())
         return ColorTarget(self.colorspace, absolute)
 
-    def paths(self, driven: DrivenAvatar, frames: Sequence[int]) -> list[CameraPath]:
-        """Return the cameras to render, at the requested resolution."""
-        whole = driven.roll_out()
-        names = self.camera_names(driven)
-        rig = self.rig(driven, frames)
-        found: list[CameraPath] = []
-        for wanted in self.camera.split(","):
-            if wanted in _MADE and wanted not in names:
-                assert whole.binding is not None
-                width, height = self.res or (rig[0].cameras[0].width, rig[0].cameras[0].height)
-                size = {"width": width, "height": height}
-                found.append(_MADE[wanted](whole.binding, whole.frame_numbers, whole.fps, **size))
-                continue
-            chosen = [path for path in rig if _means(wanted, path.name)]
-            if not chosen:
-                raise ConfigError(
-                    f"--camera {wanted}: expected all, {', '.join(_MADE)}, or some of {', '.join(names)}"
-                )
-            named = {path.name for path in found}
-            found += [path for path in chosen if path.name not in named]
-        sized = [path.resized(*self.res) if self.res else path for path in found]
-        self.check_together(sized)
-        return sized
-
-    def camera_names(self, driven: DrivenAvatar) -> list[str]:
-        """Return the names of the cameras to choose from: the capture's, or a file's."""
-        if self.cameras is None:
-            try:
-                return [camera.name for camera in driven.cameras]
-            except CheckpointError:
-                # Those made for the motion need none of the capture's but for their size.
-                if self.res is None or not set(self.camera.split(",")) <= _MADE.keys():
-                    raise
-                return []
-        if _is_usd(self.cameras):
-            from dsar_exporters import list_usd_cameras
-
-            return list_usd_cameras(self.cameras)
-        return list_cameras_json(self.cameras)
-
-    def rig(self, driven: DrivenAvatar, frames: Sequence[int]) -> list[CameraPath]:
-        """Return the chosen cameras alone: others may be of a kind that cannot be drawn."""
-        names, wanted = self.camera_names(driven), self.camera.split(",")
-        chosen = {name for name in names if any(_means(each, name) for each in wanted)}
-        if self.res is None and any(each in _MADE and each not in names for each in wanted):
-            # Cameras that are made here have the first one's size.
-            chosen.add(names[0])
-        if not chosen:
-            return []
-        if self.cameras is None:
-            return [CameraPath((camera,)) for camera in driven.cameras if camera.name in chosen]
-        fps = driven.delivered.fps
-        if _is_usd(self.cameras):
-            from dsar_exporters import read_usd_cameras
-
-            how = {"frames": frames, "resolution": self.res, "fps": fps}
-            return read_usd_cameras(self.cameras, **how, chosen=chosen)
-        return read_cameras_json(self.cameras, fps=fps, chosen=chosen)
+    def selection(self, driven: DrivenAvatar) -> CameraSelection:
+        """Return which cameras are chosen."""
+        return CameraSelection(driven, tuple(self.camera.split(",")), self.cameras, self.res)
 
     def check_together(self, paths: Sequence[CameraPath]) -> None:
         """Check what the chosen cameras have to have in common."""
@@ -264,17 +221,19 @@ class Render(DriveCommand):
                 "--mp4: expected cameras of one height, found several: give one size with --res W H"
             )
 
-    def inputs(self, driven: DrivenAvatar) -> dict[str, str]:
+    def inputs(self, selection: CameraSelection) -> dict[str, str]:
         """Return hashes of all that pictures depend on besides the command itself, by what they are of."""
-        found = {"dsar": version("dsar-avatar"), **driven.inputs}
-        rig = self.rig(driven, driven.roll_out().frame_numbers)
-        if rig:
-            found["cameras"] = sha256(cameras_to_json(rig).encode()).hexdigest()[:16]
+        driven = selection.driven
+        hashes = {"dsar": version("dsar-avatar"), **driven.inputs}
+        # Not at the frames of a task alone: every task of a job has the same hash.
+        cameras = selection.read_chosen(driven.whole.frame_numbers)
+        if cameras:
+            hashes["cameras"] = sha256(cameras_to_json(cameras).encode()).hexdigest()[:16]
         if self.exr is not None:
-            found["ocio"] = sha256(self.color_target().contents.encode()).hexdigest()[:16]
-        return found
+            hashes["ocio"] = sha256(self.color_target().contents.encode()).hexdigest()[:16]
+        return hashes
 
-    def write_template(self, path: Path, driven: DrivenAvatar, frames: Sequence[int]) -> None:
+    def write_template(self, path: Path, selection: CameraSelection, frames: Sequence[int]) -> None:
         """Write the farm's job."""
         from dsar.atomic_files import write_text_atomically
         from dsar.training.checkpoint import Run, read_config
@@ -283,13 +242,13 @@ class Render(DriveCommand):
         if self.mp4 is not None:
             raise ConfigError("--mp4: a farm's task has some frames, a video all of them; leave --mp4 out")
         run = Run(self.chosen_run())
-        describe_remains = run.scene.exists() or read_config(run).capture == EMBEDDED
-        if not describe_remains and not (self.motion_file() and self.cameras):
+        keeps_scene = run.scene.exists() or read_config(run).capture == EMBEDDED
+        if not keeps_scene and not (self.motion_file() and self.cameras):
             LOGGER.warning(
                 "Run %s is older and keeps no cameras and motions: the farm's machines need its capture",
                 run.folder,
             )
-        command = ["dsar", "render", *self.arguments(), "--expect", to_flag(self.inputs(driven))]
+        command = ["dsar", "render", *self.arguments(), "--expect", to_flag(self.inputs(selection))]
         write_text_atomically(path, openjd_template(self.name, command, frames, chunk=self.chunk))
 
     def arguments(self) -> list[str]:
@@ -310,15 +269,6 @@ class Render(DriveCommand):
             found += [flag] if value is True else [flag, *map(_absolute, _listed(value))]
         # A task that is given out again goes on where it was cut off.
         return [*found, "--skip-existing"]
-
-
-def _means(wanted: str, name: str) -> bool:
-    """Return whether a part of --camera chooses a camera."""
-    return fnmatchcase(name, "*" if wanted == "all" else wanted)
-
-
-def _is_usd(path: Path) -> bool:
-    return path.suffix.lower() in (".usd", ".usda", ".usdc", ".usdz")
 
 
 def _listed(value: object) -> Sequence[object]:

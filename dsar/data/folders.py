@@ -17,8 +17,8 @@ def is_litter(path: PurePath) -> bool:
 
 def list_folder(folder: Path) -> list[Path]:
     """Return a folder's files and folders in order, without litter; none where there is no such folder."""
-    found = folder.iterdir() if folder.is_dir() else ()
-    return sorted(path for path in found if not is_litter(PurePath(path.name)))
+    entries = folder.iterdir() if folder.is_dir() else ()
+    return sorted(path for path in entries if not is_litter(PurePath(path.name)))
 
 
 def list_images(folder: Path) -> list[Path]:

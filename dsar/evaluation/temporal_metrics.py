@@ -92,7 +92,7 @@ def _fetch(
     places = torch.stack([columns + 0.5, rows + 0.5], -1) + back
     grid = 2 * places / places.new_tensor([width, height]) - 1
     layers = torch.cat([before.color, before.alpha[..., None], (before.alpha * before.depth)[..., None]], -1)
-    found = grid_sample(layers.movedim(-1, 0)[None], grid[None], align_corners=False)[0].movedim(0, -1)
-    alpha = found[..., 3]
-    seen = found[..., 4] / alpha.clamp_min(1e-6)
-    return found[..., :3], (alpha > _OPAQUE) & ((seen - depth).abs() < _SAME_DEPTH)
+    warped = grid_sample(layers.movedim(-1, 0)[None], grid[None], align_corners=False)[0].movedim(0, -1)
+    alpha = warped[..., 3]
+    depth_there = warped[..., 4] / alpha.clamp_min(1e-6)
+    return warped[..., :3], (alpha > _OPAQUE) & ((depth_there - depth).abs() < _SAME_DEPTH)

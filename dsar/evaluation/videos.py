@@ -26,9 +26,9 @@ def record(
 ) -> tuple[Video, Video]:
     """Return the avatar's video and the true one, from one camera of the capture."""
     rollout = roll_out(avatar, capture.motions[sequence], streams=streams)
-    made = [to_bytes(render_white(gaussians, capture.cameras[camera])) for _, gaussians in rollout]
-    true = [to_bytes(true_view(capture, sequence, frame, camera).color) for frame in range(len(made))]
-    return np.stack(made), np.stack(true)
+    predicted = [to_bytes(render_white(gaussians, capture.cameras[camera])) for _, gaussians in rollout]
+    true = [to_bytes(true_view(capture, sequence, frame, camera).color) for frame in range(len(predicted))]
+    return np.stack(predicted), np.stack(true)
 
 
 def cameras_without_gaps(capture: Capture, sequence: str) -> list[int]:

@@ -53,8 +53,8 @@ def vmaf(images: Iterable[UInt8[np.ndarray, "h w 3"]], truths: Iterable[UInt8[np
         command = [get_ffmpeg_exe(), "-v", "error", *raw, "-i", "made", *raw, "-i", "true"]
         # In the folder, because a filter's argument has no safe way to hold a path.
         subprocess.run([*command, "-lavfi", compare, "-f", "null", "-"], cwd=folder, check=True)
-        found = json.loads((Path(folder) / "found.json").read_text())
-    return float(found["pooled_metrics"]["vmaf"]["mean"])
+        report = json.loads((Path(folder) / "found.json").read_text())
+    return float(report["pooled_metrics"]["vmaf"]["mean"])
 
 
 def _write(frames: Iterable[UInt8[np.ndarray, "h w 3"]], path: Path) -> tuple[int, int, int]:

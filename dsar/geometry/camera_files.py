@@ -78,7 +78,7 @@ def _load(path: Path) -> Mapping[str, Any]:
 
 def _by_name(record: Mapping[str, Any], path: Path) -> dict[str, tuple[str, Mapping[str, Any]]]:
     """Return how errors call each camera, and what the file says of it, by its name."""
-    names, found = [], []
+    names, entries = [], []
     for index, entry in enumerate(record["cameras"]):
         where = f"{path}, camera {index}"
         if not isinstance(entry, dict):
@@ -87,9 +87,9 @@ def _by_name(record: Mapping[str, Any], path: Path) -> dict[str, tuple[str, Mapp
                 "correct it"
             )
         names.append(check_name(where, entry.get("name"), ConfigError))
-        found.append((f"{where} {names[-1]}", entry))
+        entries.append((f"{where} {names[-1]}", entry))
     check_names_differ(str(path), names, ConfigError)
-    return dict(zip(names, found, strict=True))
+    return dict(zip(names, entries, strict=True))
 
 
 def write_cameras_json(paths: Sequence[CameraPath], path: Path) -> Path:

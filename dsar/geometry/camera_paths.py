@@ -173,8 +173,8 @@ def dolly(
 
 def _between(one: Camera, two: Camera, share: float) -> Camera:
     start, end = one.T_camera_world.double(), two.T_camera_world.double()
-    turn = axis_angle_from_matrix(end[:3, :3] @ start[:3, :3].T)
-    rotation = matrix_from_axis_angle(share * turn) @ start[:3, :3]
+    rotation_vector = axis_angle_from_matrix(end[:3, :3] @ start[:3, :3].T)
+    rotation = matrix_from_axis_angle(share * rotation_vector) @ start[:3, :3]
     center, goal = (-transform[:3, :3].T @ transform[:3, 3] for transform in (start, end))
     transform = torch.eye(4, dtype=torch.float64, device=start.device)
     transform[:3, :3] = rotation

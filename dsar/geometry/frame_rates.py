@@ -34,9 +34,9 @@ def parse_rate(text: str, flag: str = "--fps") -> float:
     Raises:
         ConfigError: It is no rate, or none from 1 to 1000.
     """
-    rate, found = Fraction(0), _RATE.fullmatch(text.strip())
-    if found and (divisor := int(found[2] or 1)):
-        rate = Fraction(found[1]) / divisor
+    rate, match = Fraction(0), _RATE.fullmatch(text.strip())
+    if match and (divisor := int(match[2] or 1)):
+        rate = Fraction(match[1]) / divisor
     if not _SLOWEST <= rate <= _FASTEST:
         raise ConfigError(
             f"{flag} {text}: expected frames per second from {_SLOWEST} to {_FASTEST}, such as 24, 23.976 or "

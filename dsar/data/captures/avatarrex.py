@@ -91,11 +91,11 @@ def _read_row(where: str, row: Mapping[str, str]) -> Camera:
         [0, numbers["fy"] * height, numbers["py"] * height],
         [0, 0, 1],
     ]
-    turn = torch.tensor([numbers[key] for key in ("rx", "ry", "rz")], dtype=torch.float64)
-    place = torch.tensor([numbers[key] for key in ("tx", "ty", "tz")], dtype=torch.float64)
+    rotation_vector = torch.tensor([numbers[key] for key in ("rx", "ry", "rz")], dtype=torch.float64)
+    center = torch.tensor([numbers[key] for key in ("tx", "ty", "tz")], dtype=torch.float64)
     transform = torch.eye(4, dtype=torch.float64)
-    transform[:3, :3] = matrix_from_axis_angle(turn).T
-    transform[:3, 3] = -transform[:3, :3] @ place
+    transform[:3, :3] = matrix_from_axis_angle(rotation_vector).T
+    transform[:3, 3] = -transform[:3, :3] @ center
     return make_camera(where, camera_name(row["name"]), K, transform.tolist(), (width, height), CaptureError)
 
 

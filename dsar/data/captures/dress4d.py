@@ -151,8 +151,10 @@ def read_data(path: Path) -> Mapping[str, Any]:
 
 def _read_info(folder: Path) -> tuple[list[str], str | None]:
     info = read_data(folder / _INFO)
-    found = info.get("scan_frames")
-    frames = [str(frame) for frame in found] if isinstance(found, (list, tuple, np.ndarray)) else []
+    scan_frames = info.get("scan_frames")
+    frames = (
+        [str(frame) for frame in scan_frames] if isinstance(scan_frames, (list, tuple, np.ndarray)) else []
+    )
     if not frames:
         raise CaptureError(f"{folder / _INFO}: expected the names of frames as scan_frames, found none")
     gender = info.get("gender")

@@ -96,10 +96,11 @@ def open_native(root: Path, body: Path | None = None) -> MultiViewCapture:
 
 def _read_record(where: Path) -> dict[str, Any]:
     record = read_json(where, CaptureError)
-    found = (record.get("format"), record.get("version")) if isinstance(record, dict) else (None, None)
-    if found != (FORMAT, VERSION):
+    version = (record.get("format"), record.get("version")) if isinstance(record, dict) else (None, None)
+    if version != (FORMAT, VERSION):
         raise CaptureError(
-            f"{where}: expected format {FORMAT!r} version {VERSION}, found {found[0]!r} version {found[1]!r}"
+            f"{where}: expected format {FORMAT!r} version {VERSION}, "
+            f"found {version[0]!r} version {version[1]!r}"
         )
     return record
 

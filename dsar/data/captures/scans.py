@@ -132,8 +132,8 @@ def sample_texture(texture: Float[Tensor, "h w 3"], uv: Float[Tensor, "n 2"]) ->
     """Return bilinear colours at texture coordinates, and ones. Row 0 of the data set's textures is v = 0."""
     grid = (2 * uv - 1)[None, None]
     image = texture.permute(2, 0, 1)[None]
-    found = torch.nn.functional.grid_sample(image, grid, padding_mode="border", align_corners=False)
-    return torch.cat([found[0, :, 0].T, torch.ones(len(uv), 1)], -1)
+    colors = torch.nn.functional.grid_sample(image, grid, padding_mode="border", align_corners=False)
+    return torch.cat([colors[0, :, 0].T, torch.ones(len(uv), 1)], -1)
 
 
 @dataclass(frozen=True)
@@ -175,18 +175,18 @@ def virtual_cameras(released: Sequence[Camera], center: Float[np.ndarray, "3"]) 
 
     Y is up.
     """
-    places = np.stack([camera.center.double().numpy() for camera in released]) - center
-    azimuths = np.arctan2(places[:, 0], places[:, 2])
+    centers = np.stack([camera.center.double().numpy() for camera in released]) - center
+    azimuths = np.arctan2(centers[:, 0], centers[:, 2])
     # The middle of the first gap going round; the ring is even.
-    turns = np.sort(np.mod(azimuths - azimuths[0], 2 * math.pi))
-    first = azimuths[0] + (turns[1] / 2 if len(turns) > 1 else math.pi / VIRTUAL_CAMERAS)
-    distance, height = np.hypot(places[:, 0], places[:, 2]).mean(), places[:, 1].mean()
-    like, made = released[0], []
-    K = like.K.clone()
-    K[0, 2], K[1, 2] = like.width / 2, like.height / 2
+    azimuth_gaps = np.sort(np.mod(azimuths - azimuths[0], 2 * math.pi))
+    first = azimuths[0] + (azimuth_gaps[1] / 2 if len(azimuth_gaps) > 1 else math.pi / VIRTUAL_CAMERAS)
+    distance, height = np.hypot(centers[:, 0], centers[:, 2]).mean(), centers[:, 1].mean()
+    template, cameras = released[0], []
+    K = template.K.clone()
+    K[0, 2], K[1, 2] = template.width / 2, template.height / 2
     for index in range(VIRTUAL_CAMERAS):
         angle = first + 2 * math.pi * index / VIRTUAL_CAMERAS
-        place = center + np.array([distance * math.sin(angle), height, distance * math.cos(angle)])
-        transform = look_at(place, center.astype(np.float64))
-        made.append(dataclasses.replace(like, K=K, T_camera_world=transform, name=f"scan{index}"))
-    return made
+        position = center + np.array([distance * math.sin(angle), height, distance * math.cos(angle)])
+        transform = look_at(position, center.astype(np.float64))
+        cameras.append(dataclasses.replace(template, K=K, T_camera_world=transform, name=f"scan{index}"))
+    return cameras

@@ -127,8 +127,8 @@ def fitted_body(
     name: str, path: Path | None, betas: Float[Tensor, " s"], gender: str
 ) -> tuple[Body, Path | None]:
     """Return the body with which a motion was fitted, and its file; else the embedded one, and warn."""
-    found = choose_body(path, gender)
-    if found is None:
+    body_file = choose_body(path, gender)
+    if body_file is None:
         LOGGER.warning(
             "Capture %s was fitted with a %s SMPL-X body, which needs a licence: the embedded body, which is "
             "another, takes its place and will be centimetres off. Give SMPL-X's file with --body or in "
@@ -136,7 +136,7 @@ def fitted_body(
             *(name, gender),
         )
         return load_body(), None
-    return load_body(found, betas), found
+    return load_body(body_file, betas), body_file
 
 
 def rotation_to_upright(name: str, motions: Sequence[Motion]) -> Float[Tensor, "3 3"]:

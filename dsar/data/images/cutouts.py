@@ -28,8 +28,8 @@ class Cutouts:
         self.path, self.conversions = path, conversions
         # A zip stays open and its images are read one by one: all of them may not fit in memory.
         self.archive = None if path.is_dir() else _open_archive(path)
-        found = list_members(self.archive) if self.archive else _walk(path)
-        self.names = dict(zip(map(_plain, _without_top(found)), found, strict=True))
+        members = list_members(self.archive) if self.archive else _walk(path)
+        self.names = dict(zip(map(_plain, _without_top(members)), members, strict=True))
         self._lengths: dict[str, int] = {}
         self._encodings: dict[str, MaskEncoding] = {}
 
@@ -42,11 +42,11 @@ class Cutouts:
         name = self._find(camera, frame)
         if name is None:
             raise CaptureError(f"images {self.path}: no {camera.name}/{frame:04d}.webp or .png")
-        where, found = self._where(name), self._decode(camera, name)
+        where, photograph = self._where(name), self._decode(camera, name)
         encoding = self._encoding(camera)
-        self.conversions.log("images", found.notes, where)
+        self.conversions.log("images", photograph.notes, where)
         self.conversions.log("masks", encoding.notes, where)
-        return np.dstack([found.color, encoding.decode(_alpha(found), where)])
+        return np.dstack([photograph.color, encoding.decode(_alpha(photograph), where)])
 
     def check(self, cameras: Sequence[Camera], frames: int) -> None:
         """Raise CaptureError unless every camera has images, and the first of them can be one of its."""

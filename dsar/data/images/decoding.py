@@ -40,12 +40,12 @@ def decode_photograph(data: bytes | Path, camera: Camera, where: str, mask: Path
     """
     with open_image(data, where) as image:
         _refuse_size(displayed_size(image), image.size, camera, where, "mask", mask)
-        turned = check_orientation(image, (camera.width, camera.height))
+        orientation_notes = check_orientation(image, (camera.width, camera.height))
         image = apply_orientation(image, (camera.width, camera.height))
-        found = read_photograph(image, where)
-        if mask is None and found.alpha is None:
+        photograph = read_photograph(image, where)
+        if mask is None and photograph.alpha is None:
             raise CaptureError(_no_alpha(where, image.mode))
-    return Photograph(found.color, found.alpha, (*turned, *found.notes))
+    return Photograph(photograph.color, photograph.alpha, (*orientation_notes, *photograph.notes))
 
 
 def decode_mask_levels(path: Path, camera: Camera, photograph: Path | None = None) -> MaskLevels:
@@ -61,10 +61,10 @@ def decode_mask_levels(path: Path, camera: Camera, photograph: Path | None = Non
     """
     with open_image(path, str(path)) as image:
         _refuse_size(displayed_size(image), image.size, camera, str(path), "photograph", photograph)
-        turned = check_orientation(image, (camera.width, camera.height))
+        orientation_notes = check_orientation(image, (camera.width, camera.height))
         image = apply_orientation(image, (camera.width, camera.height))
-        found = read_mask_levels(image, str(path))
-    return MaskLevels(found.values, (*turned, *found.notes))
+        levels = read_mask_levels(image, str(path))
+    return MaskLevels(levels.values, (*orientation_notes, *levels.notes))
 
 
 def check_image_header(

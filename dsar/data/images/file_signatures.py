@@ -39,9 +39,9 @@ def describe_file(data: bytes | Path) -> str:
         return "zeros alone, a copy that was cut short: copy it again"
     if head[4:8] == b"ftyp":
         return f"{_BRANDS.get(head[8:12], 'a video (MP4, MOV)')}: convert it to PNG or JPEG"
-    found = next((words for sign, words in _SIGNS if head.startswith(sign)), None)
-    if found:
-        return found
+    description = next((words for sign, words in _SIGNS if head.startswith(sign)), None)
+    if description:
+        return description
     text = head.lstrip(b"\xef\xbb\xbf \t\r\n").lower()
     if text.startswith((b"<!doctype html", b"<html")):
         return "a web page (HTML), of a download that failed: download it again"

@@ -72,15 +72,15 @@ class Photos:
         Raises:
             CaptureError: They are not what a camera's photographs and masks can be.
         """
-        found: dict[tuple[str, Note], list[Path]] = defaultdict(list)
+        files_by_note: dict[tuple[str, Note], list[Path]] = defaultdict(list)
         for camera in cameras:
             frame = next(frame for frame in range(len(self.frames)) if self.has(camera, frame))
             color, mask = self._existing(camera, frame)
             for note in check_image_header(color, camera, str(color), mask):
-                found["photographs", note].append(color)
+                files_by_note["photographs", note].append(color)
             for note in self._encoding(camera).notes:
-                found["masks", note].append(mask)
-        for (kind, note), files in found.items():
+                files_by_note["masks", note].append(mask)
+        for (kind, note), files in files_by_note.items():
             share = f" of {len(files)} of {len(cameras)} cameras"
             self.conversions.log(kind, [note], str(files[0]), share)
 
@@ -126,7 +126,7 @@ def read_missing_list(path: Path) -> frozenset[tuple[str, int]]:
     Raises:
         CaptureError: a line does not end in CAMERA/FRAME.jpg.
     """
-    found = set()
+    missing = set()
     if not path.is_file():
         return frozenset()
     for number, line in enumerate(read_text(path, CaptureError).splitlines(), 1):
@@ -138,5 +138,5 @@ def read_missing_list(path: Path) -> frozenset[tuple[str, int]]:
             raise CaptureError(f"{path}, line {number}: expected CAMERA/FRAME.jpg, found {line!r}")
         # Masks lie deeper: CAMERA/mask/pha/FRAME.jpg.
         camera = parts[-4] if len(parts) > 3 and parts[-3:-1] == ["mask", "pha"] else parts[-2]
-        found.add((camera, int(frame)))
-    return frozenset(found)
+        missing.add((camera, int(frame)))
+    return frozenset(missing)

@@ -113,13 +113,17 @@ def check_orientation(image: Image.Image, size: tuple[int, int]) -> list[Note]:
     A quarter turn after which the image had not its camera's size, but has before, is not done: then the
     calibration is of the picture as it is stored.
     """
-    found = _orientation(image)
-    if found == 1:
+    orientation = _orientation(image)
+    if orientation == 1:
         return []
     if not _is_turned(image, size):
-        return [Note(f"have EXIF orientation {found}, not applied: as they are stored they fit their camera")]
-    what = f"have EXIF orientation {found} and are turned by it, as viewers show them"
-    return [Note(what, doubtful=found not in _QUARTERS)]
+        return [
+            Note(
+                f"have EXIF orientation {orientation}, not applied: as they are stored they fit their camera"
+            )
+        ]
+    what = f"have EXIF orientation {orientation} and are turned by it, as viewers show them"
+    return [Note(what, doubtful=orientation not in _QUARTERS)]
 
 
 def displayed_size(image: Image.Image) -> tuple[int, int]:
@@ -237,10 +241,10 @@ def _of_color(color: UInt8[np.ndarray, "h w 3"], where: str) -> MaskLevels:
 def _orientation(image: Image.Image) -> int:
     """Return an image's EXIF orientation, 1 to 8; 1 where it has none that can be read."""
     try:
-        found = image.getexif().get(ExifTags.Base.Orientation, 1)
+        orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
     except _DAMAGE:
         return 1
-    return found if found in range(1, 9) else 1
+    return orientation if orientation in range(1, 9) else 1
 
 
 def _is_turned(image: Image.Image, size: tuple[int, int]) -> bool:

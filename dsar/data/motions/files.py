@@ -75,9 +75,9 @@ def read_motion(
     arrays = read_arrays(path)
     rotations, translations = read_poses(path, arrays)
     filed = Motion(rotations, translations, fps or read_rate(path, arrays), path.stem)
-    found = _told_up_axis(up) or detect_up_axis(trace_joints(body, filed).positions, "z")
-    _log_interpretation(path, found, f"{filed.fps:g} fps", level)
-    return filed if found.axis == "y" else rotate_motion(filed, body, rotation_to_y_up(found.axis))
+    up_axis = _told_up_axis(up) or detect_up_axis(trace_joints(body, filed).positions, "z")
+    _log_interpretation(path, up_axis, f"{filed.fps:g} fps", level)
+    return filed if up_axis.axis == "y" else rotate_motion(filed, body, rotation_to_y_up(up_axis.axis))
 
 
 def _read_bvh(path: Path, body: Body, up: Up | None, fps: float | None) -> Motion:
@@ -89,9 +89,9 @@ def _read_bvh(path: Path, body: Body, up: Up | None, fps: float | None) -> Motio
     match = _match_person(path, skeleton, bones, positions)
     joints = body_joint_positions(match, positions)
     metres = float(leg_length(body.joints) / leg_length(joints).median())
-    found = _told_up_axis(up) or detect_up_axis(metres * joints, "y")
+    up_axis = _told_up_axis(up) or detect_up_axis(metres * joints, "y")
     rest = find_standing_rest(match, bones, skeleton.parents)
-    rotation = rotation_to_y_up(found.axis).double()
+    rotation = rotation_to_y_up(up_axis.axis).double()
     tips = {joint: torch.tensor(tip, dtype=torch.float64) for joint, tip in skeleton.tips.items()}
     clip = SkeletonClip(rotation @ rotations, positions @ rotation.T, tuple(skeleton.parents), tips, match)
     rests = "in no person's pose, so its joints are aligned by how they move"
@@ -99,7 +99,7 @@ def _read_bvh(path: Path, body: Body, up: Up | None, fps: float | None) -> Motio
         rests = "standing" if torch.equal(rest, torch.eye(3).to(rest)) else "standing, turned"
     _log_interpretation(
         path,
-        found,
+        up_axis,
         f"{len(skeleton.names)} joints by their {match.matched_by}, rest {rests}, "
         f"1 unit = {metres:.3g} m (legs), {bvh.fps:.6g} fps",
     )
@@ -124,8 +124,8 @@ def _match_person(path: Path, skeleton: Skeleton, bones: Tensor, positions: Tens
     return match
 
 
-def _told_up_axis(filed: Up | None) -> UpAxis | None:
-    return UpAxis(filed, "told") if filed else None
+def _told_up_axis(up: Up | None) -> UpAxis | None:
+    return UpAxis(up, "told") if up else None
 
 
 def _log_interpretation(path: Path, up: UpAxis, rest: str, level: int = logging.INFO) -> None:

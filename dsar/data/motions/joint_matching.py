@@ -89,18 +89,18 @@ def _limbs_by_name(names: Sequence[str], parents: Sequence[int]) -> tuple[list[s
     limbs, missing = {}, []
     for side in SIDES:
         for chain in _CHAINS:
-            found = {}
+            chain_joints = {}
             for joint in chain:
                 index = next((sided[side, word] for word in _WORDS[joint] if (side, word) in sided), None)
                 if index is None:
                     missing.append(f"{side} {joint}")
                 else:
-                    found[joint] = index
-            direction = [found[joint] for joint in chain if joint in found]
+                    chain_joints[joint] = index
+            direction = [chain_joints[joint] for joint in chain if joint in chain_joints]
             for upper, lower in pairwise(direction):
                 if upper == lower or _path(parents, lower, upper) is None:
                     missing.append(f"{names[lower]} below {names[upper]}")
-            limbs |= {f"{side}_{joint}": index for joint, index in found.items()}
+            limbs |= {f"{side}_{joint}": index for joint, index in chain_joints.items()}
     return missing, None if missing else limbs
 
 

@@ -24,8 +24,8 @@ def pose_features(motion: Motion) -> Float[Tensor, "f 126"]:
 
 def median_distance(features: Float[Tensor, "n d"]) -> float:
     """Return the median distance of two poses, the usual bandwidth of the kernel."""
-    some = features[:: max(1, len(features) // _ROWS)]
-    return float(torch.pdist(some).median())
+    subset = features[:: max(1, len(features) // _ROWS)]
+    return float(torch.pdist(subset).median())
 
 
 def mmd(x: Float[Tensor, "n d"], y: Float[Tensor, "m d"], bandwidth: float) -> float:

@@ -104,11 +104,11 @@ def body_joint_positions(match: JointMatch, positions: Float[Tensor, "*f j 3"]) 
     index: list[int] = []
     for name, parent in zip(JOINT_NAMES[:_BODY_JOINTS], PARENTS, strict=False):
         index.append(known[name] if name in known else index[parent])
-    found = positions[..., index, :].clone()
+    joints = positions[..., index, :].clone()
     if match.head is None:
-        shoulders = found[..., [_AT["left_shoulder"], _AT["right_shoulder"]], :].mean(-2)
-        found[..., [_AT["neck"], _AT["head"]], :] = shoulders[..., None, :]
-    return found
+        shoulders = joints[..., [_AT["left_shoulder"], _AT["right_shoulder"]], :].mean(-2)
+        joints[..., [_AT["neck"], _AT["head"]], :] = shoulders[..., None, :]
+    return joints
 
 
 def leg_length(joints: Float[Tensor, "*f j 3"]) -> Float[Tensor, "*f"]:

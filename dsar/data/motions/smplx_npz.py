@@ -212,17 +212,19 @@ def _what_instead(stream: BinaryIO) -> str:
     start = stream.read(8)
     if start.startswith(b"PK"):
         return "it is cut, its end is missing; copy it again"
-    found = next((kind for mark, kind in _FOREIGN.items() if start.startswith(mark)), "no .npz archive")
-    what = found if start else "empty"
+    kind_of_file = next(
+        (kind for mark, kind in _FOREIGN.items() if start.startswith(mark)), "no .npz archive"
+    )
+    what = kind_of_file if start else "empty"
     return f"it is {what}; save poses, trans and mocap_frame_rate with numpy.savez"
 
 
 def _one_key(path: Path, arrays: Mapping[str, np.ndarray], keys: tuple[str, ...], instead: str = "") -> str:
     """Return the first of the keys that the file has, or raise."""
-    found = next((key for key in keys if key in arrays), None)
-    if found is None:
+    present = next((key for key in keys if key in arrays), None)
+    if present is None:
         wanted = " or ".join((*keys, instead) if instead else keys)
         raise MotionError(
             f"motion file {path}: lacks {wanted}; it has {', '.join(arrays) or 'nothing we know'}"
         )
-    return found
+    return present

@@ -63,8 +63,8 @@ def check_capture(capture: MultiViewCapture, report: Reporter = lambda *_: None)
         findings += find_gross_faults(capture, hypothesis, masks, agreements)
         report("look for fine mistakes", 0.95)
         if not any(finding.fatal for finding in findings):
-            some = min(_FINE_CAMERAS, len(capture.cameras))
-            findings += find_fine_faults(capture, hypothesis, load_masks(capture, usable, FINE, some))
+            fine_cameras = min(_FINE_CAMERAS, len(capture.cameras))
+            findings += find_fine_faults(capture, hypothesis, load_masks(capture, usable, FINE, fine_cameras))
     # In other units every step is a jump.
     if not any(finding.name.startswith("motion_in") for finding in findings):
         findings += [

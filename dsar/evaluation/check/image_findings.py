@@ -26,7 +26,7 @@ def find_mask_faults(capture: MultiViewCapture, summaries: Sequence[ImageSummary
         what = f"masks cover {border:.0%} of the images' borders: they show the background; invert them"
         findings.append(Finding("masks_inverted", what, True))
     hollow = [summary for summary in summaries if summary.coverage == 0]
-    for name, some, what in (
+    for name, affected, what in (
         (
             "full_masks",
             [summary for summary in summaries if summary.full],
@@ -45,12 +45,12 @@ def find_mask_faults(capture: MultiViewCapture, summaries: Sequence[ImageSummary
             "cover no pixel by half; write them as the camera's others, the person as the highest number",
         ),
     ):
-        if some:
-            first = some[0]
+        if affected:
+            first = affected[0]
             where = f"{first.sequence}, frame {first.frame}, {capture.cameras[first.camera].name}"
             highest = f", up to {first.highest} of 255" if name == "faint_masks" else ""
-            what = f"{len(some)} of {len(summaries)} masks (the first: {where}{highest}) {what}"
-            findings.append(Finding(name, what, len(some) == len(summaries)))
+            what = f"{len(affected)} of {len(summaries)} masks (the first: {where}{highest}) {what}"
+            findings.append(Finding(name, what, len(affected) == len(summaries)))
     return findings
 
 
@@ -65,10 +65,10 @@ def find_color_faults(
         usable: Sequence, frame and camera of those whose mask has a shape.
     """
     findings = []
-    seen: dict[int, list[ImageSummary]] = defaultdict(list)
+    views_of_camera: dict[int, list[ImageSummary]] = defaultdict(list)
     for summary in summaries:
         if (summary.sequence, summary.frame, summary.camera) in usable:
-            seen[summary.camera].append(summary)
+            views_of_camera[summary.camera].append(summary)
     # Colours under alpha 0 mean nothing where images are no photographs.
     for misfit in find_misaligned_masks(capture, usable) if capture.backdrop else ():
         names = ", ".join(capture.cameras[index].name for index in misfit.cameras)
@@ -81,14 +81,18 @@ def find_color_faults(
                 True,
             )
         )
-    if len(seen) < 2:
+    if len(views_of_camera) < 2:
         return findings
-    chroma = {index: statistics.median(each.chroma for each in some) for index, some in seen.items()}
+    chroma = {
+        index: statistics.median(each.chroma for each in views) for index, views in views_of_camera.items()
+    }
     grey = [capture.cameras[index].name for index, value in chroma.items() if value < _GREY]
     if grey and max(chroma.values()) > _COLORED:
         what = f"the images of {', '.join(grey)} are grey, the others' have colours: leave them out"
         findings.append(Finding("grey_cameras", what))
-    light = {index: statistics.median(each.light for each in some) for index, some in seen.items()}
+    light = {
+        index: statistics.median(each.light for each in views) for index, views in views_of_camera.items()
+    }
     usual = statistics.median(light.values())
     for index, value in light.items():
         if usual > 0 and not usual / _EXPOSED <= value <= usual * _EXPOSED:

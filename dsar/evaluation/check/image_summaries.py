@@ -137,8 +137,8 @@ def _cover(alpha: UInt8[np.ndarray, "h w"]) -> tuple[float, float, bool]:
 
 def _describe(image: UInt8[np.ndarray, "h w 4"]) -> tuple[float, float]:
     """Return the person's mean linear luminance and mean distance between channels, from some pixels."""
-    some = image[::_SKIPPED, ::_SKIPPED]
-    person = some[some[..., 3] > 127][:, :3]
+    sampled = image[::_SKIPPED, ::_SKIPPED]
+    person = sampled[sampled[..., 3] > 127][:, :3]
     if not len(person):
         return 0.0, 0.0
     luminance = linear_from_srgb(person / 255) @ _LUMINANCE

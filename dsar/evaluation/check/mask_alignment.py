@@ -56,9 +56,9 @@ def find_misaligned_masks(
                 scores[index].append(np.array(mask_information(image[..., :3], image[..., 3])))
     groups: dict[str, list[int]] = defaultdict(list)
     for index, views in scores.items():
-        turn = _better(np.array(views))
-        if turn is not None:
-            groups[turn].append(index)
+        misalignment = _better(np.array(views))
+        if misalignment is not None:
+            groups[misalignment].append(index)
     misfits = []
     for how, cameras in groups.items():
         means = np.concatenate([scores[index] for index in cameras]).mean(0)
@@ -99,8 +99,8 @@ def _better(views: Float[np.ndarray, "v t"]) -> str | None:
 
 
 def _entropy(share: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
-    some = np.clip(share, 1e-12, 1 - 1e-12)
-    return -(some * np.log(some) + (1 - some) * np.log(1 - some))
+    probability = np.clip(share, 1e-12, 1 - 1e-12)
+    return -(probability * np.log(probability) + (1 - probability) * np.log(1 - probability))
 
 
 def _reduced(image: UInt8[np.ndarray, "h w 4"]) -> Float[np.ndarray, "y x 4"]:

@@ -172,7 +172,7 @@ class Study:
         avatar, config, provenance = load_checkpoint(run)
         capture = open_images(run, config)
         streams: list[Stream] = [stream for stream in STREAMS if stream not in each.zeroed]
-        found = {
+        content = {
             "config": json.loads(config_to_json(config)),
             "settings": dict(model.settings),
             "seed": model.seed,
@@ -181,13 +181,13 @@ class Study:
         # The battery needs no more than one core and is over when `evaluate` comes to measure times.
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as other:
             battery = None if each.zeroed else other.submit(_stress, run.folder, self.cases)
-            found |= {
+            content |= {
                 "updates": read_progress(run).step,
                 **evaluate(avatar, capture, streams=streams).to_json(),
             }
             if battery is not None:
-                found["stress"] = battery.result()
-        write_text_atomically(self._figures(each), json.dumps(found, indent=1) + "\n")
+                content["stress"] = battery.result()
+        write_text_atomically(self._figures(each), json.dumps(content, indent=1) + "\n")
 
 
 def _stress(folder: Path, cases: Mapping[str, Case]) -> dict[str, Any]:
