@@ -37,7 +37,7 @@ class Chart:
         """Return the same part of a map with one row for every `factor` rows of the atlas."""
         return dataclasses.replace(self, rows=range(self.rows.start // factor, self.rows.stop // factor))
 
-    def holds(self, rows: Int64[Tensor, " n"]) -> Bool[Tensor, " n"]:
+    def holds(self, rows: Int64[Tensor, "*n"]) -> Bool[Tensor, "*n"]:
         """Return which rows are the chart's."""
         return (rows >= self.rows.start) & (rows < self.rows.stop)
 

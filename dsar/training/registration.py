@@ -14,8 +14,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dsar.avatar.avatar import Avatar, blend_transforms
+from dsar.avatar.avatar import Avatar
 from dsar.avatar.driving import DrivingSignal
+from dsar.body.skinning import blend_transforms
 from dsar.config import TrainConfig
 from dsar.geometry.cameras import project
 from dsar.raster import rasterize, reduced_dilation
