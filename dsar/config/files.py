@@ -53,7 +53,7 @@ def _from_value(hint: Any, value: Any, name: str) -> Any:
     if get_origin(hint) is Literal:
         fits = value in parts
     elif get_origin(hint) is tuple:
-        fits = isinstance(value, list) and all(_is_of(each, parts[0]) for each in value)
+        fits = isinstance(value, list) and all(_is_of(item, parts[0]) for item in value)
     else:
         fits = any(_is_of(value, kind) for kind in parts or (hint,))
     if not fits:

@@ -151,12 +151,12 @@ def _tensors(content: bytes) -> dict[str, Tensor]:
 
 def newest_run(root: Path = Path("runs")) -> Run:
     """Return the run with the newest checkpoint under `runs/`."""
-    found = sorted(root.glob("*/checkpoint/progress.json"), key=lambda path: path.stat().st_mtime)
-    if not found:
+    runs = sorted(root.glob("*/checkpoint/progress.json"), key=lambda path: path.stat().st_mtime)
+    if not runs:
         raise CheckpointError(
             f"no trained run under {root.absolute()}; name one, or train one: dsar train --preset demo"
         )
-    return Run(found[-1].parent.parent)
+    return Run(runs[-1].parent.parent)
 
 
 def read_config(run: Run) -> TrainConfig:
@@ -183,10 +183,10 @@ def _located(run: Run, recorded: str, what: str) -> str:
         candidates += [above / path for above in folder.parents]
     elif run.exists and (then := read_progress(run).folder):
         candidates.append((folder / os.path.relpath(path, then)).resolve())
-    found = next((each for each in candidates if each.exists()), candidates[0])
-    if found != candidates[0]:
-        LOGGER.warning("Run %s: its %s is not at %s, but at %s", run.folder, what, candidates[0], found)
-    return str(found)
+    located = next((place for place in candidates if place.exists()), candidates[0])
+    if located != candidates[0]:
+        LOGGER.warning("Run %s: its %s is not at %s, but at %s", run.folder, what, candidates[0], located)
+    return str(located)
 
 
 def load_checkpoint(run: Run) -> tuple[Avatar, TrainConfig, dict[str, str]]:
@@ -238,11 +238,11 @@ def _avatar(tensors: dict[str, Tensor], config: TrainConfig, path: Path) -> Avat
     atlas = Atlas(charts, width, tensors["texels"], *(tensors[f"texel_{name}"] for name in fields))
     avatar = Avatar(body, atlas, config.model, float(tensors.pop("fps")))
     expected = {name: tuple(value.shape) for name, value in avatar.state_dict().items()}
-    found = {name: tuple(value.shape) for name, value in tensors.items()}
-    for name in sorted(expected.keys() | found.keys()):
-        if expected.get(name) != found.get(name):
+    present = {name: tuple(value.shape) for name, value in tensors.items()}
+    for name in sorted(expected.keys() | present.keys()):
+        if expected.get(name) != present.get(name):
             raise CheckpointError(
-                f"{path}: {name} has shape {found.get(name, 'none')}, by config.json "
+                f"{path}: {name} has shape {present.get(name, 'none')}, by config.json "
                 f"{expected.get(name, 'none')}; one of the two files is of another run: copy both from one"
             )
     avatar.load_state_dict(tensors)

@@ -102,7 +102,7 @@ class ChunkTrainer:
         return self._backward(loss, None, self.config.schedule.chunk_frames)
 
     def backward_chunk(
-        self, rng: np.random.Generator, now: ScheduleState, *, probe: bool = False
+        self, rng: np.random.Generator, schedule_state: ScheduleState, *, probe: bool = False
     ) -> UpdateMetrics:
         """Step every rollout by K frames and back-propagate L_total (paper equation 22).
 
@@ -111,21 +111,23 @@ class ChunkTrainer:
         """
         self.avatar.unhide_covered_texels()
         schedule = self.config.schedule
-        streams = STREAMS if now.stage == "autoregressive" else ()
+        streams = STREAMS if schedule_state.stage == "autoregressive" else ()
         losses: dict[str, Tensor] = defaultdict(lambda: torch.zeros(()))
         mse, count = torch.zeros(()), 0
         for _ in range(schedule.chunk_frames):
-            cursors, fresh = self.state.rollouts.next_frames(rng, now.max_rollout_frames)
+            cursors, fresh = self.state.rollouts.next_frames(rng, schedule_state.max_rollout_frames)
             rendered = [i for i in range(len(cursors)) if rng.random() < schedule.rendered_fraction]
             targets = [
-                self.loader.request(rng, cursors[i].sequence, cursors[i].frame, now.reduction, schedule.views)
+                self.loader.request(
+                    rng, cursors[i].sequence, cursors[i].frame, schedule_state.reduction, schedule.views
+                )
                 for i in rendered
             ]
             step = self._step(cursors, fresh, streams=streams)
             outputs = step.unmirrored_output.select(rendered)
             batch = self.avatar.gaussians(step.motion_window[rendered], outputs) if rendered else []
             for gaussians, frame_targets in zip(batch, targets, strict=True):
-                view = self._views(rng, gaussians, frame_targets, now.reduction)
+                view = self._views(rng, gaussians, frame_targets, schedule_state.reduction)
                 losses["render"] = losses["render"] + view[0]
                 mse, count = mse + view[1], count + len(frame_targets)
             for name, loss in self._regularizers(step, streams).items():

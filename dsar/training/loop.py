@@ -103,15 +103,15 @@ def _train(config: TrainConfig, folder: Path, resume: bool, report: Reporter | N
                 write_checkpoint(run, state)
                 leave(received)
                 return
-            now = schedule_at(schedule, state.progress)
-            if now.stage != "template" and not state.registered.complete:
+            schedule_state = schedule_at(schedule, state.progress)
+            if schedule_state.stage != "template" and not state.registered.complete:
                 show = partial(monitor.show, state.step, state.progress, "registration")
                 stop, used = _register(registration, gradients, received, clock, used, show)
                 continue
-            set_rates(state.optimizers, now)
+            set_rates(state.optimizers, schedule_state)
             rng = np.random.default_rng([config.seed, workers.rank(), state.step])
             gradients.clear()
-            metrics = _backward(trainer, rng, now, state.step)
+            metrics = _backward(trainer, rng, schedule_state, state.step)
             monitor.update(metrics)
             before, (stop, used) = used, gradients.average(bool(received), clock.used())
             if not gradients.buffer.isfinite().all():
@@ -125,7 +125,7 @@ def _train(config: TrainConfig, folder: Path, resume: bool, report: Reporter | N
             speedup = state.registered.schedule_speedup(schedule.template_fraction)
             state.progress = max(state.step / schedule.steps, state.progress + (used - before) * speedup)
             if workers.rank() == 0 and (state.step % REPORT_EVERY == 0 or state.progress >= 1):
-                monitor.write(state.step, state.progress, now.stage, clock.seconds())
+                monitor.write(state.step, state.progress, schedule_state.stage, clock.seconds())
             if state.progress >= 1 or state.step % SAVE_EVERY == 0:
                 write_checkpoint(run, state)
 
@@ -160,17 +160,19 @@ def _register(
 
 
 def _backward(
-    trainer: ChunkTrainer, rng: np.random.Generator, now: ScheduleState, step: int
+    trainer: ChunkTrainer, rng: np.random.Generator, schedule_state: ScheduleState, step: int
 ) -> UpdateMetrics:
     """Compute the gradients of one update."""
     try:
-        if now.stage == "template":
-            return trainer.backward_template(rng, now.reduction)
-        if now.stage == "pretraining":
+        if schedule_state.stage == "template":
+            return trainer.backward_template(rng, schedule_state.reduction)
+        if schedule_state.stage == "pretraining":
             return trainer.backward_pretraining(rng)
-        return trainer.backward_chunk(rng, now, probe=workers.rank() == 0 and step % PROBE_EVERY == 0)
+        return trainer.backward_chunk(
+            rng, schedule_state, probe=workers.rank() == 0 and step % PROBE_EVERY == 0
+        )
     except TrainingError as error:
-        raise TrainingError(f"step {step} ({now.stage}): {error}") from error
+        raise TrainingError(f"step {step} ({schedule_state.stage}): {error}") from error
 
 
 def training_clips(capture: Capture) -> dict[str, range]:

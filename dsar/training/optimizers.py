@@ -33,23 +33,26 @@ def make_optimizers(
     Adam's epsilon is far below the default: inner gradients of this network are smaller than 1e-8.
     """
     hidden = avatar.network.hidden_weights() if schedule.muon_rate else []
-    chosen = {id(weight) for weight in hidden}
-    others = [p for p in avatar.network.parameters() if id(p) not in chosen]
-    groups = [{"params": others, "name": "network"}]
+    muon_ids = {id(weight) for weight in hidden}
+    adam_weights = [p for p in avatar.network.parameters() if id(p) not in muon_ids]
+    groups = [{"params": adam_weights, "name": "network"}]
     groups += [{"params": [p], "name": name} for name, p in avatar.template.named_parameters()]
     groups += [{"params": list(rest.parameters()), "name": "rest"}]
     adam = torch.optim.Adam(groups, lr=0.0, betas=(0.9, 0.99), eps=1e-15, fused=True)
     return {"adam": adam} | ({"muon": Muon(hidden)} if hidden else {})
 
 
-def set_rates(optimizers: Mapping[str, torch.optim.Optimizer], now: ScheduleState) -> None:
+def set_rates(optimizers: Mapping[str, torch.optim.Optimizer], schedule_state: ScheduleState) -> None:
     """Set the learning rates of this update."""
-    fitting = now.stage == "template"
-    rates = {name: rate * now.template_factor for name, rate in _TEMPLATE_RATES.items()}
+    fitting = schedule_state.stage == "template"
+    rates = {name: rate * schedule_state.template_factor for name, rate in _TEMPLATE_RATES.items()}
     rates["means"] *= _TRAVEL if fitting else 1.0
-    rates |= {"network": now.network_rate, "rest": _REST_RATE * now.template_factor * fitting}
+    rates |= {
+        "network": schedule_state.network_rate,
+        "rest": _REST_RATE * schedule_state.template_factor * fitting,
+    }
     for group in optimizers["adam"].param_groups:
         group["lr"] = rates[group["name"]]
     if "muon" in optimizers:
         for group in optimizers["muon"].param_groups:
-            group["lr"] = now.muon_rate
+            group["lr"] = schedule_state.muon_rate

@@ -101,17 +101,17 @@ class Registration:
             self.maps.fitted[name] += 1
             return None
 
-        def some_views() -> list[tuple[Target, float]]:
+        def draw_views() -> list[tuple[Target, float]]:
             count = min(FAST_VIEWS if fast else VIEWS, len(cameras))
             return [view(int(k)) for k in rng.choice(cameras, count, replace=False)]
 
-        guess = self._best(motion_window, guesses, some_views())
+        guess = self._best(motion_window, guesses, draw_views())
         offset = guess.clone().requires_grad_()
         optimizer = torch.optim.Adam([offset], FAST_RATE if fast else RATE, betas=(0.8, 0.9))
         loss, mse = torch.zeros(()), torch.zeros(())
         for _ in range(STEPS):
             optimizer.zero_grad()
-            loss, mse = self._compare(motion_window, offset, some_views(), rng.random(3))
+            loss, mse = self._compare(motion_window, offset, draw_views(), rng.random(3))
             loss = loss + JOLT * self._roughness(offset - guess)
             loss.backward(inputs=[offset])
             optimizer.step()
@@ -135,12 +135,12 @@ class Registration:
 
         Rest is among them, so that a print that was lost is found again when the cloth comes to rest.
         """
-        garment, seen = self.garment, frame - self.maps.clips[name].start
+        garment, frames_before = self.garment, frame - self.maps.clips[name].start
         rest = self.rest.earliest(name)
-        if seen == 0:
+        if frames_before == 0:
             return [rest], False
         before = self.maps.offsets[name][frame - 1, garment]
-        if seen == 1:
+        if frames_before == 1:
             return [before, rest], False
         change = self._inertia(motion_window, name, frame) - before
         norm = change.norm(dim=1, keepdim=True)
@@ -169,12 +169,12 @@ class Registration:
         gaussians = self.avatar.gaussians(motion_window, self.avatar.offset_garment(offset[None]))[0]
         color = torch.from_numpy(background.astype(np.float32))
         loss, mse = torch.zeros(()), torch.zeros(())
-        for target, share in views:
+        for target, weight in views:
             output = rasterize(
                 gaussians, target.camera, background=color, dilation=reduced_dilation(REDUCTION)
             )
-            one, error = image_loss(output, target, color, self.loss, None)
-            loss, mse = loss + share * one / len(views), mse + error / len(views)
+            view_loss, error = image_loss(output, target, color, self.loss, None)
+            loss, mse = loss + weight * view_loss / len(views), mse + error / len(views)
         return loss + ROUGHNESS * self._roughness(offset), mse
 
     def _roughness(self, offset: Float[Tensor, "g 3"]) -> Float[Tensor, ""]:

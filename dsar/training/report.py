@@ -68,10 +68,10 @@ class Monitor:
         self._smoothed: UpdateMetrics | None = None
         self._warned: set[str] = set()
 
-    def update(self, done: UpdateMetrics) -> None:
+    def update(self, metrics: UpdateMetrics) -> None:
         """Take in one update; say once of each regulariser that it moves nothing, or more than images do."""
-        self._smoothed = _smooth(self._smoothed, done)
-        for name, share in (done.gradients or {}).items():
+        self._smoothed = _smooth(self._smoothed, metrics)
+        for name, share in (metrics.gradients or {}).items():
             if name not in self._warned and not (share == 0 or _LEAST_SHARE <= share <= _LARGEST_SHARE):
                 self._warned.add(name)
                 effect = "moves almost nothing" if share < 1 else "outweighs the images"
@@ -90,24 +90,26 @@ class Monitor:
         if self._reporter is not None:
             self._reporter(line)
 
-    def show(self, step: int, progress: float, stage: str, seconds: float, done: UpdateMetrics) -> None:
+    def show(self, step: int, progress: float, stage: str, seconds: float, metrics: UpdateMetrics) -> None:
         """Show the listener work that counts as no update."""
         if self._reporter is not None:
-            self._reporter(self._line(step, progress, stage, seconds, done))
+            self._reporter(self._line(step, progress, stage, seconds, metrics))
 
-    def _line(self, step: int, progress: float, stage: str, seconds: float, done: UpdateMetrics) -> Report:
-        psnr = decibels(done.mse or 0.0)
+    def _line(self, step: int, progress: float, stage: str, seconds: float, metrics: UpdateMetrics) -> Report:
+        psnr = decibels(metrics.mse or 0.0)
         gained = progress - self._began
         left = seconds * (1 - progress) / gained if gained > 0 else None
-        return Report(step, self._steps, progress, stage, done.loss, psnr, seconds, left, done.gradients)
+        return Report(
+            step, self._steps, progress, stage, metrics.loss, psnr, seconds, left, metrics.gradients
+        )
 
 
-def _smooth(before: UpdateMetrics | None, now: UpdateMetrics) -> UpdateMetrics:
+def _smooth(before: UpdateMetrics | None, newest: UpdateMetrics) -> UpdateMetrics:
     if before is None:
-        return now
+        return newest
     # An update without images keeps what the last images said.
-    mse = now.mse if before.mse is None else before.mse
-    if now.mse is not None and before.mse is not None:
-        mse = (1 - _NEW) * before.mse + _NEW * now.mse
-    gradients = before.gradients if now.gradients is None else now.gradients
-    return UpdateMetrics((1 - _NEW) * before.loss + _NEW * now.loss, mse, gradients)
+    mse = newest.mse if before.mse is None else before.mse
+    if newest.mse is not None and before.mse is not None:
+        mse = (1 - _NEW) * before.mse + _NEW * newest.mse
+    gradients = before.gradients if newest.gradients is None else newest.gradients
+    return UpdateMetrics((1 - _NEW) * before.loss + _NEW * newest.loss, mse, gradients)

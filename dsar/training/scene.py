@@ -43,7 +43,7 @@ class Scene:
 
     def is_of(self, other: "Scene") -> bool:
         """Return whether another scene has the same cameras, motions and splits, to the last bit."""
-        mine, theirs = (_recorded(each) for each in (self, other))
+        mine, theirs = (_recorded(scene) for scene in (self, other))
         return mine[0] == theirs[0] and all(
             torch.equal(value, theirs[1][key]) for key, value in mine[1].items()
         )

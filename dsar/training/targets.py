@@ -57,8 +57,8 @@ class TargetLoader:
         self, rng: np.random.Generator, sequence: str, frame: int, reduction: int, count: int
     ) -> list[Future[Target]]:
         """Begin to load some of the views of a frame, as many as there are at most."""
-        seen = self.capture.cameras_with_image(sequence, frame)
-        chosen = rng.choice(seen, min(count, len(seen)), replace=False) if seen else ()
+        cameras = self.capture.cameras_with_image(sequence, frame)
+        chosen = rng.choice(cameras, min(count, len(cameras)), replace=False) if cameras else ()
         return [
             self._threads.submit(load_target, self.capture, sequence, frame, int(index), reduction)
             for index in chosen

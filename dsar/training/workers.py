@@ -24,7 +24,7 @@ from dsar.errors import DsarError, TrainingError
 EXTRA_NUMBERS = 2
 """Extra numbers that travel with the gradients: a request to stop, and the share of the budget used."""
 _BACKEND = "gloo"
-_LAST_WORDS_S, _FAREWELL_S = 5.0, 30.0
+_ERROR_TIMEOUT_S, _JOIN_TIMEOUT_S = 5.0, 30.0
 """How long a worker that broke the group may take to say why, and one that is done to end."""
 
 
@@ -105,50 +105,50 @@ def run_workers(count: int, work: Callable[..., None], arguments: tuple[Any, ...
     with tempfile.TemporaryDirectory() as folder:
         rendezvous = (Path(folder) / "rendezvous").as_uri()
         context = torch.multiprocessing.get_context("spawn")
-        said = context.SimpleQueue()
+        errors = context.SimpleQueue()
         group = (rendezvous, count, work)
-        others = [
-            context.Process(target=_work_beside, args=(said, i, *group, (*arguments, None)), daemon=True)
+        processes = [
+            context.Process(target=_work_beside, args=(errors, i, *group, (*arguments, None)), daemon=True)
             for i in range(1, count)
         ]
-        for process in others:
+        for process in processes:
             process.start()
-        patience_s = _FAREWELL_S
+        timeout_s = _JOIN_TIMEOUT_S
         try:
             _work(0, *group, (*arguments, report))
         except DsarError:
-            patience_s = 0.0  # they would wait for this one
+            timeout_s = 0.0  # they would wait for this one
             raise
         except RuntimeError as error:
             # The group breaks when one of it goes; that one knows why.
-            _raise_what_others_said(said, others, error)
+            _raise_cause(errors, processes, error)
         finally:
-            for process in others:
-                process.join(timeout=patience_s)
+            for process in processes:
+                process.join(timeout=timeout_s)
                 process.kill()
 
 
-def _raise_what_others_said(said: Any, others: Sequence[Any], error: RuntimeError) -> NoReturn:
+def _raise_cause(errors: Any, processes: Sequence[Any], error: RuntimeError) -> NoReturn:
     """Raise what another worker said, or how one ended; else what happened here."""
-    deadline = time.monotonic() + _LAST_WORDS_S
-    while time.monotonic() < deadline and all(process.is_alive() for process in others):
+    deadline = time.monotonic() + _ERROR_TIMEOUT_S
+    while time.monotonic() < deadline and all(process.is_alive() for process in processes):
         time.sleep(0.05)
-    if not said.empty():
-        raise said.get() from error
-    codes = {number: each.exitcode for number, each in enumerate(others, 1) if each.exitcode}
+    if not errors.empty():
+        raise errors.get() from error
+    codes = {number: process.exitcode for number, process in enumerate(processes, 1) if process.exitcode}
     for number, code in codes.items():
         how = f"signal {-code}" if code < 0 else f"code {code}"
         memory = ", probably because memory ran out: give fewer --workers" if code == -signal.SIGKILL else ""
-        raise TrainingError(f"worker {number} of {len(others) + 1} ended with {how}{memory}") from error
+        raise TrainingError(f"worker {number} of {len(processes) + 1} ended with {how}{memory}") from error
     raise error
 
 
-def _work_beside(said: Any, *arguments: Any) -> None:
+def _work_beside(errors: Any, *arguments: Any) -> None:
     """Work in a process beside the first; what a user should know is told to it, and said by it alone."""
     try:
         _work(*arguments)
     except (DsarError, OSError) as error:
-        said.put(error)
+        errors.put(error)
         sys.exit(1)
     except RuntimeError as error:
         if _BACKEND not in str(error):
