@@ -34,7 +34,7 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from dsar.avatar.avatar import Avatar
-from dsar.body.atlas import Atlas
+from dsar.avatar.charts import Atlas
 from dsar.config import PRESETS, ModelConfig
 from dsar.data.captures.formats import open_capture
 from dsar.evaluation.profiling import count_stage_flops, read_clock, time_stages
@@ -95,9 +95,7 @@ def find_atlas(preset: str) -> tuple[Atlas, Motion]:
     """Return a preset's atlas of the embedded capture, and a motion."""
     capture, config = open_capture(), PRESETS[preset]
     avatar = Avatar.from_capture(capture, capture.body, config.atlas, config.model)
-    fields = ("positions", "weights", "frames", "tangents", "hidden")
-    atlas = Atlas(*avatar.atlas_size, avatar.texels, *(getattr(avatar, f"texel_{name}") for name in fields))
-    return atlas, capture.motions["far"]
+    return avatar.atlas, capture.motions["far"]
 
 
 def build(case: Case, design: str, device: str) -> Subject:
@@ -106,10 +104,10 @@ def build(case: Case, design: str, device: str) -> Subject:
     atlas, motion = find_atlas(case.preset)
     config = case.config("shared" if design == LITERAL else design)
     avatar = Avatar(open_capture().body, atlas, config, motion.fps)
-    signal = avatar.driving_signal(motion).to(device)
     network = avatar.to(device).network
+    signal = avatar.driving_signal(motion)
     torch.nn.init.normal_(network.decoder.head.weight, std=0.01)
-    drawn = _draw(config, case, avatar.grid_size, device)
+    drawn = _draw(config, case, avatar.control.size, device)
     if design == LITERAL:
         reference = ReferenceNetwork(network, doubling_kernels(network))
         rollout, training = ReferenceRollout(reference), partial(_train_reference, reference, *drawn)
@@ -122,7 +120,7 @@ def build(case: Case, design: str, device: str) -> Subject:
     def step() -> NetworkOutput:
         return rollout.step(maps, magnitude)
 
-    motion_window, camera = signal[[70]], make_camera(*case.image)
+    motion_window, camera = signal.windows[[70]], make_camera(*case.image)
 
     @torch.no_grad()
     def frame() -> RenderOutput:

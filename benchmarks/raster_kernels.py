@@ -40,8 +40,8 @@ def measure_kernels(gaussians: Gaussians, camera: Camera, repeats: int) -> Kerne
         for _ in range(repeats + 1):
             color = rasterize(leaves, camera, backend="cpu").color
             torch.autograd.grad(color, [leaves.means], v_color)
-    medians = {name: 1e3 * float(np.median(found[1:])) for name, found in seconds.items()}
-    # Kernel, records, tile_starts, pairs, ...
+    medians = {name: 1e3 * float(np.median(durations[1:])) for name, durations in seconds.items()}
+    # Kernel, records, tile_offsets, pairs, ...
     blocks = arguments["composite_part"][3][:, 1].copy().view(np.uint8)
     lanes = int(np.unpackbits(blocks).sum()) * LANES
     gflops = {name: 1e-6 * lanes * flop / medians[name] for name, flop in FLOP_PER_LANE.items()}
@@ -53,19 +53,21 @@ def _timed(seconds: dict[str, list[float]], arguments: dict[str, tuple]) -> Iter
     """Have every kernel of the rasteriser timed and its last arguments kept."""
 
     def watch(name, function):
-        def watched(*given):
+        def watched(*kernel_arguments):
             start = time.perf_counter()
-            result = function(*given)
+            result = function(*kernel_arguments)
             seconds[name].append(time.perf_counter() - start)
-            arguments[name] = given
+            arguments[name] = kernel_arguments
             return result
 
         return watched
 
-    plain = {name: getattr(cpu, name) for name in ("run_parts", "sort_by_depth", "place_pairs")}
+    plain = {name: getattr(cpu, name) for name in ("run_parts", "sort_by_depth", "prefix_sum")}
     try:
-        cpu.run_parts = lambda kernel, *given: watch(kernel.__name__, plain["run_parts"])(kernel, *given)
-        for name in ("sort_by_depth", "place_pairs"):
+        cpu.run_parts = lambda kernel, *kernel_arguments: watch(kernel.__name__, plain["run_parts"])(
+            kernel, *kernel_arguments
+        )
+        for name in ("sort_by_depth", "prefix_sum"):
             setattr(cpu, name, watch(name, plain[name]))
         yield
     finally:

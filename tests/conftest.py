@@ -58,8 +58,8 @@ def cameras():
 def speckled(body, motion):
     """Yield the Gaussians of a body with a fixed random colour at each texel."""
     from dsar.avatar.avatar import Avatar
+    from dsar.avatar.charts import Atlas, body_chart
     from dsar.avatar.rollout import roll_out
-    from dsar.body.atlas import Atlas, body_chart
     from dsar.config import ModelConfig
 
     generator = torch.Generator().manual_seed(5)
@@ -159,8 +159,8 @@ def trained(tiny_capture, tmp_path_factory) -> Path:
 def figure():
     """A coloured body that turns and bends, all of whose Gaussians change in every frame."""
     from dsar.avatar.avatar import Avatar
+    from dsar.avatar.charts import Atlas, body_chart
     from dsar.avatar.rollout import roll_out
-    from dsar.body.atlas import Atlas, body_chart
     from dsar.body.files import load_body
     from dsar.config import ModelConfig
     from dsar.types import Motion

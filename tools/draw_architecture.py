@@ -34,7 +34,7 @@ BOXES = {
     "raster": (7.6, 2.5, 2.0, TRAINING, "Rasteriser", "", "raster/"),
     "losses": (5.0, 2.5, 2.0, TRAINING, "Losses", "equations 17-23", "training/chunk.py"),
     "capture": (2.5, 2.5, 2.0, INPUT, "Images and masks", "", "data/captures"),
-    "sequence": (10.1, 0.5, 2.4, DELIVERY, "Sequence of frames", "", "avatar/rollout.py"),
+    "sequence": (10.1, 0.5, 2.4, DELIVERY, "Player", "", "avatar/player.py"),
     "usd": (13.0, 0.5, 2.0, DELIVERY, "USD, PLY, SPZ, GLB", "", "dsar_exporters"),
     "exr": (7.6, 0.5, 2.0, DELIVERY, "EXR, PNG, MP4", "", "dsar_render"),
 }  # fmt: skip

@@ -9,59 +9,112 @@ Where a body jumps (a cut, a glitch of the capture), its past jumps with it: not
 and cloth that were told of it would fly apart.
 """
 
+import logging
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dsar.avatar.guards import LIMITS
+from dsar.body.skinning import forward_kinematics
 from dsar.geometry.rotations import heading_matrix
+from dsar.types import Body, Motion
 
-JUMP_SPEED = 12.0
-"""Metres per second of the pelvis above which a body has not moved, but jumped."""
-JUMP_ANGULAR_SPEED = 20 * math.pi
-"""Radians per second of the pelvis above which it has, too."""
+LOGGER = logging.getLogger(__name__)
 
 
-def driving_signal(
-    transforms: Float[Tensor, "f j 4 4"],
-    pelvis: Float[Tensor, "3"],
-    fps: float,
-    time_constants: tuple[float, ...],
-) -> Float[Tensor, "f t j 4 4"]:
-    """Return the driving signal of a motion; before its first frame the body is taken to have stood in it.
+@dataclass(frozen=True)
+class DrivingSignal:
+    """A motion of a body, its kinematics done: made once, and passed to all who need any of it."""
 
-    A mean forgets by a factor of e in its time constant. It is of transforms relative to the pelvis's
-    position in the world, and is moved to the newest such position: a steady walk does not lag behind itself.
+    name: str
+    """The motion's."""
+    fps: float
+    """Frames per second."""
+    transforms: Float[Tensor, "f j 4 4"]
+    """T_world_rest by frame and joint."""
+    windows: Float[Tensor, "f t j 4 4"]
+    """The motion window of every frame."""
+    jumps: tuple[int, ...]
+    """Frames in which the body is where it cannot have come from the frame before."""
 
-    Args:
-        transforms: T_world_rest by frame and joint; the pelvis is joint 0.
-        pelvis: Its place at rest, metres.
-        fps: Frames per second.
-        time_constants: Of the running means, seconds.
-    """
-    jumps = find_jumps(transforms, pelvis, fps)
-    if not jumps:
-        return torch.cat(
-            [_newest_frames(transforms), _running_means(transforms, pelvis, fps, time_constants)], 1
-        )
-    jumps_so_far = _accumulated_jumps(transforms, pelvis, jumps)
-    continuous = jumps_so_far.inverse()[:, None] @ transforms
-    signal = torch.cat(
-        [_newest_frames(continuous), _running_means(continuous, pelvis, fps, time_constants)], 1
-    )
-    return jumps_so_far[:, None, None] @ signal
+    def __len__(self) -> int:
+        """Return the number of frames."""
+        return len(self.transforms)
+
+    @classmethod
+    def of_motion(cls, body: Body, motion: Motion, time_constants: Sequence[float]) -> "DrivingSignal":
+        """Return the driving signal of a body's motion; one that jumps is logged.
+
+        Args:
+            body: Who moves; its precision and device are the signal's.
+            motion: Poses at a fixed rate.
+            time_constants: Of the running means, seconds.
+        """
+        rotations, translations = motion.rotations.to(body.joints), motion.translations.to(body.joints)
+        transforms = forward_kinematics(body, rotations, translations)
+        signal = cls.of_transforms(transforms, body.joints[0], motion.fps, time_constants, motion.name)
+        for frame in signal.jumps:
+            LOGGER.warning(
+                "Motion %s: the body jumps at frame %d of %d (%.2f s); its clothes go with it",
+                *(motion.name, frame, len(motion), frame / motion.fps),
+            )
+        return signal
+
+    @classmethod
+    def of_transforms(
+        cls,
+        transforms: Float[Tensor, "f j 4 4"],
+        pelvis: Float[Tensor, "3"],
+        fps: float,
+        time_constants: Sequence[float],
+        name: str = "motion",
+    ) -> "DrivingSignal":
+        """Return the driving signal of joints; before its first frame the body is taken to have stood in it.
+
+        A mean forgets by a factor of e in its time constant. It is of transforms relative to the pelvis's
+        position in the world, and is moved to the newest such position: a steady walk does not lag behind
+        itself.
+
+        Args:
+            transforms: T_world_rest by frame and joint; the pelvis is joint 0.
+            pelvis: Its position at rest, metres.
+            fps: Frames per second.
+            time_constants: Of the running means, seconds.
+            name: The motion's.
+        """
+        jumps = find_jumps(transforms, pelvis, fps)
+        if jumps:
+            jumped = _accumulated_jumps(transforms, pelvis, jumps)
+            windows = _windows(jumped.inverse()[:, None] @ transforms, pelvis, fps, time_constants)
+            windows = jumped[:, None, None] @ windows
+        else:
+            windows = _windows(transforms, pelvis, fps, time_constants)
+        return cls(name, fps, transforms, windows, tuple(jumps))
 
 
 def find_jumps(transforms: Float[Tensor, "f j 4 4"], pelvis: Float[Tensor, "3"], fps: float) -> list[int]:
     """Return the frames in which a body is where it cannot have come from the frame before."""
     rotations, positions = transforms[:, 0, :3, :3], _pelvis_positions(transforms, pelvis)
-    far = positions.diff(dim=0).norm(dim=-1) > JUMP_SPEED / fps
+    far = positions.diff(dim=0).norm(dim=-1) > LIMITS.jump_speed / fps
     # The trace of a rotation by an angle is 1 + 2 cos(angle).
     change = rotations[:-1].mT @ rotations[1:]
     cosines = (change.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
-    turned = cosines < math.cos(min(JUMP_ANGULAR_SPEED / fps, math.pi))
+    turned = cosines < math.cos(min(LIMITS.jump_angular_speed / fps, math.pi))
     return [int(frame) + 1 for frame in (far | turned).nonzero()]
+
+
+def _windows(
+    transforms: Float[Tensor, "f j 4 4"],
+    pelvis: Float[Tensor, "3"],
+    fps: float,
+    time_constants: Sequence[float],
+) -> Float[Tensor, "f t j 4 4"]:
+    """Return the motion windows of a motion without jumps."""
+    return torch.cat([_newest_frames(transforms), _running_means(transforms, pelvis, fps, time_constants)], 1)
 
 
 def _newest_frames(transforms: Float[Tensor, "f j 4 4"]) -> Float[Tensor, "f 3 j 4 4"]:
@@ -74,7 +127,7 @@ def _running_means(
     transforms: Float[Tensor, "f j 4 4"],
     pelvis: Float[Tensor, "3"],
     fps: float,
-    time_constants: tuple[float, ...],
+    time_constants: Sequence[float],
 ) -> Float[Tensor, "f l j 4 4"]:
     root = torch.zeros_like(transforms)
     root[..., :3, 3] = _pelvis_positions(transforms, pelvis)[:, None]
@@ -106,11 +159,11 @@ def _accumulated_jumps(
     ground_frames = torch.eye(4).to(transforms).repeat(len(transforms), 1, 1)
     ground_frames[:, :3, :3] = heading_matrix(transforms[:, 0, :3, :3])
     ground_frames[:, :3:2, 3] = _pelvis_positions(transforms, pelvis)[:, ::2]
-    jumps_so_far = torch.eye(4).to(transforms).repeat(len(transforms), 1, 1)
+    jumped = torch.eye(4).to(transforms).repeat(len(transforms), 1, 1)
     for frame in jumps:
         last = max(frame - 2, 0)
-        before, newest = jumps_so_far[[last, frame - 1]].inverse() @ ground_frames[[last, frame - 1]]
+        before, newest = jumped[[last, frame - 1]].inverse() @ ground_frames[[last, frame - 1]]
         expected = newest @ before.inverse() @ newest
         expected[:3, 3] = 2 * newest[:3, 3] - before[:3, 3]
-        jumps_so_far[frame:] = ground_frames[frame] @ expected.inverse()
-    return jumps_so_far
+        jumped[frame:] = ground_frames[frame] @ expected.inverse()
+    return jumped

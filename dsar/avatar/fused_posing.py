@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int32
+from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from dsar.avatar.bilinear import BilinearSampling
 from dsar.avatar.posing import nearest_quaternions
 from dsar.avatar.template import SCALE_RANGE, GaussianParameters
 from dsar.geometry.harmonics import rotate_harmonics
@@ -21,44 +22,11 @@ from dsar.types import Gaussians
 _SMALLEST, _LARGEST = map(np.float32, SCALE_RANGE)
 
 
-def bilinear_sampling(
-    rows: Tensor, columns: Tensor, upsample: int, size: tuple[int, int], square: int
-) -> tuple[Int32[Tensor, "n 4"], Float[Tensor, "n 4"]]:
-    """Return the four grid cells (flat) around each texel and their bilinear weights.
-
-    Charts end where they end: nothing is sampled from the other one. The body's is clamped on all sides; the
-    garment's, from texel row `square` on, is a tube, whose first column follows its last.
-
-    `rows` and `columns` count texels; a cell covers `upsample` x `upsample` of them.
-    """
-    tube, (height, width) = rows >= square, size
-    down, across = ((texel + 0.5) / upsample - 0.5 for texel in (rows, columns))
-    first = torch.where(tube, square // upsample, 0)
-    last = torch.where(tube, height, min(square // upsample, height)) - 1
-    down = torch.minimum(torch.maximum(down, first), last)
-    across = torch.where(tube, across, across.clamp(0, width - 1))
-    top, left = down.floor().long(), across.floor().long()
-    bottom, right = torch.minimum(top + 1, last), left + 1
-    down, across = down - top, across - left
-    left, right = (torch.where(tube, edge % width, edge.clamp_max(width - 1)) for edge in (left, right))
-    cells = torch.stack([y * width + x for y in (top, bottom) for x in (left, right)], -1)
-    weights = torch.stack([v * u for v in (1 - down, down) for u in (1 - across, across)], -1)
-    return cells.int(), weights.float()
-
-
-def sample_bilinear(
-    maps: Float[Tensor, "b c h w"], bilinear: tuple[Int32[Tensor, "n 4"], Float[Tensor, "n 4"]]
-) -> Float[Tensor, "b n c"]:
-    """Return map values at every texel, bilinear between the grid's cells."""
-    cells, weights = bilinear
-    return (maps.flatten(2).transpose(1, 2)[:, cells] * weights[:, :, None]).sum(2)
-
-
 def pose_fused(
     template: GaussianParameters,
     offset: Float[Tensor, "b 3 h w"],
     appearance: Float[Tensor, "b a h w"],
-    bilinear: tuple[Int32[Tensor, "n 4"], Float[Tensor, "n 4"]],
+    sampling: BilinearSampling,
     axes: Float[Tensor, "n 3 3"],
     blended: Float[Tensor, "b n 3 4"],
 ) -> list[Gaussians]:
@@ -68,7 +36,7 @@ def pose_fused(
         template: raw parameters that the residuals are added to.
         offset: metres along each texel's `axes`.
         appearance: residuals of raw values, as `GaussianParameters.activate` takes them.
-        bilinear: cells and weights of `bilinear_sampling`.
+        sampling: how each texel is sampled from the maps.
         axes: columns are the offset's axes in the canonical frame.
         blended: the linear blend of bone transforms at each texel.
     """
@@ -78,7 +46,7 @@ def pose_fused(
     for entry, bone_rotation, transform in zip(values, bone_rotations, blended, strict=True):
         means, rotations, scales, opacities, harmonics = _Pose.apply(
             entry, template.means, template.quaternions, template.log_scales, template.opacity_logits,
-            template.harmonics, *bilinear, axes, transform, bone_rotation,
+            template.harmonics, *sampling, axes, transform, bone_rotation,
         )  # fmt: skip
         if harmonics.shape[1] > 1:
             harmonics = rotate_harmonics(harmonics[None], bone_rotation[None])[0]

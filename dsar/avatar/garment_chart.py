@@ -11,8 +11,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from dsar.body.atlas import Chart, surface_frames
+from dsar.avatar.charts import ChartTexels
 from dsar.body.model import JOINT_NAMES
+from dsar.body.uv_map import surface_frames
 from dsar.geometry.cameras import project
 from dsar.types import Body, Capture
 
@@ -40,7 +41,7 @@ def fit_garment_chart(
     pelvis: Float[Tensor, "f 4 4"],
     size: tuple[int, int],
     smoothing: float,
-) -> Chart | None:
+) -> ChartTexels | None:
     """Return a tube of size (rows, columns) around the loose garment, or None where there is none.
 
     `frames` should be still; `pelvis` is T_world_rest of the pelvis in each. Columns go once around, from
@@ -68,7 +69,8 @@ def fit_garment_chart(
     weights = diffuse_weights(body, positions, smoothing)
     axes = surface_frames(directions.repeat(size[0], 1))
     tangents = tube_tangents(positions.unflatten(0, size))
-    return Chart(torch.ones(size, dtype=torch.bool), positions, weights, axes, tangents)
+    covered = torch.ones(size, dtype=torch.bool)
+    return ChartTexels("garment", "tube", covered, positions, weights, axes, tangents)
 
 
 def tube_tangents(positions: Float[Tensor, "r c 3"]) -> Float[Tensor, "n 3 2"]:
@@ -78,7 +80,7 @@ def tube_tangents(positions: Float[Tensor, "r c 3"]) -> Float[Tensor, "n 3 2"]:
     return torch.stack([right, down], -1).flatten(0, 1)
 
 
-def texels_beneath(body: Body, chart: Chart, points: Chart) -> Bool[Tensor, " n"]:
+def texels_beneath(body: Body, chart: ChartTexels, points: ChartTexels) -> Bool[Tensor, " n"]:
     """Return which texels of the body's chart lie inside a garment's tube at rest; arms never do."""
     center = body.joints[0]
     offset, tube = points.positions - center, (chart.positions - center).unflatten(0, chart.covered.shape)

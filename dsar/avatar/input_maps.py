@@ -1,75 +1,98 @@
-"""Position, velocity, acceleration and lag maps: what the network sees of a motion (paper equation 4)."""
+"""The network's input maps: where control points are, how they move, and where inertia would have them."""
 
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float, Int
 from torch import Tensor
+
+from dsar.avatar.control_grid import ControlGrid
+from dsar.avatar.guards import LIMITS, Guard, GuardCounts
+from dsar.body.skinning import blend_transforms
+from dsar.config import ModelConfig
+from dsar.geometry.rotations import heading_matrix
 
 REFERENCE_FPS = 30.0
 """Reference rate: velocities are metres per 1/30 s whatever the motion's own rate."""
-SPEED_LIMIT = 0.4
-"""Metres per 1/30 s (12 m/s) at which velocities are cut, so that a teleport cannot explode the network."""
-LAG_LIMIT = 1.0
-"""Metres at which lags are cut, likewise."""
 
 
 @dataclass(frozen=True)
 class InputMaps:
-    """The input maps of a batch of frames on the network's grid, metres and reference frames."""
+    """The input maps of a batch of frames on the network's grid; cells without a control point are zero."""
 
     maps: Float[Tensor, "b c h w"]
-    """Position in the heading frame; velocity, acceleration and lags along given axes; not standardised."""
+    """Position, velocity, acceleration and lags, metres and reference frames; not standardised."""
     magnitude: Float[Tensor, "b 1 h w"]
     """Motion magnitude V, metres per 1/30 s."""
-
-
-def limit_norm(vectors: Float[Tensor, "*b 3"], limit: float) -> Float[Tensor, "*b 3"]:
-    """Shorten vectors that are longer than the limit, keeping their direction."""
-    norm = vectors.norm(dim=-1, keepdim=True)
-    return vectors * (limit / norm.clamp_min(limit))
-
-
-def _resolve(vectors: Float[Tensor, "b p 3"], axes: Float[Tensor, "b p 3 3"]) -> Float[Tensor, "b p 3"]:
-    """Return the components of world vectors along axes given as columns."""
-    return (vectors[..., :, None] * axes).sum(-2)
+    guard_counts: GuardCounts
+    """How many control points had a velocity or a lag cut, by frame of the batch."""
 
 
 def make_input_maps(
-    points: Float[Tensor, "b t p 3"],
-    headings: Float[Tensor, "b 3 3"],
-    axes: Float[Tensor, "b p 3 3"],
-    roots: Float[Tensor, "b 3"],
-    cells: Int64[Tensor, " p"],
-    size: tuple[int, int],
+    control: ControlGrid,
+    motion_windows: Float[Tensor, "b t j 4 4"],
+    pelvis: Float[Tensor, "3"],
     fps: float,
-    *,
-    velocity: bool,
-    acceleration: bool,
+    model: ModelConfig,
 ) -> InputMaps:
-    """Return input maps from the posed control points of each motion window.
+    """Return the input maps p, dp and the motion magnitudes V = |dp| of a batch of frames (paper equation 6).
 
-    `points[:, :3]` are those of a frame and the two before it, newest first, in world metres, the rest
-    where running means of the motion put them; a lag is the way from the newest frame to such a mean.
-    Positions are relative to the root on the ground plane and turned by the inverse heading; gravity's
-    direction and the height stay. Velocities are true world velocities, so a spin or a walk remains
-    visible, resolved along `axes` (columns, world) and cut at SPEED_LIMIT; lags likewise at LAG_LIMIT.
-    `cells` are flat grid indices of the points; other cells are zero.
+    The previous offset joins them in the network's encoder. Channels, in their order:
+
+    - position p: relative to the pelvis's place on the ground, turned by the inverse of its heading; height
+      and the direction of gravity are the world's;
+    - velocity dp, if the model has it: true world velocity, so that a spin or a walk is visible, along the
+      control points' axes, cut at `Limits.speed`; its length, whatever the model has, is V;
+    - acceleration, if the model has it: change of the cut velocity, along the same axes;
+    - for each running mean of the motion window the lag: the way from the control point to where that mean
+      puts it, along the same axes, cut at `Limits.lag`.
+
+    Args:
+        control: Control points.
+        motion_windows: T_world_rest of joints: a frame, the two before it, and running means (see `driving`).
+        pelvis: Its position at rest, metres.
+        fps: Frames per second of the motion.
+        model: Which maps there are, and along which axes.
     """
-    ground = roots * roots.new_tensor([1.0, 0.0, 1.0])
+    rows = motion_windows[..., :3, :].transpose(-3, -2).flatten(-2)
+    points = (rows @ control.basis.mT).mT
+    pelvis_transforms = motion_windows[:, 0, 0]
+    root = pelvis_transforms[:, :3, :3] @ pelvis + pelvis_transforms[:, :3, 3]
+    headings = heading_matrix(pelvis_transforms[:, :3, :3])
+    if model.axes == "surface":
+        axes = blend_transforms(control.weights, motion_windows[:, :1])[:, 0, :, :, :3] @ control.frames
+    else:
+        axes = headings[:, None].expand(-1, len(control.cells), -1, -1)
+    ground = root * root.new_tensor([1.0, 0.0, 1.0])
     rate = fps / REFERENCE_FPS
     position = (points[:, 0] - ground[:, None]) @ headings
-    velocity_now = limit_norm((points[:, 0] - points[:, 1]) * rate, SPEED_LIMIT)
-    velocity_before = limit_norm((points[:, 1] - points[:, 2]) * rate, SPEED_LIMIT)
+    velocity, fast = limit_norm((points[:, 0] - points[:, 1]) * rate, LIMITS.speed)
+    velocity_before, _ = limit_norm((points[:, 1] - points[:, 2]) * rate, LIMITS.speed)
     channels = [position]
-    if velocity:
-        channels.append(_resolve(velocity_now, axes))
-    if acceleration:
-        channels.append(_resolve((velocity_now - velocity_before) * rate, axes))
+    if model.velocity:
+        channels.append(_along(axes, velocity))
+    if model.acceleration:
+        channels.append(_along(axes, (velocity - velocity_before) * rate))
+    counts = {Guard.SPEED: fast}
     for mean in points[:, 3:].unbind(1):
-        channels.append(_resolve(limit_norm(mean - points[:, 0], LAG_LIMIT), axes))
-    values = torch.cat([*channels, velocity_now.norm(dim=-1, keepdim=True)], -1)
-    grid = values.new_zeros(len(values), values.shape[-1], size[0] * size[1])
-    grid[:, :, cells] = values.transpose(1, 2)
-    grid = grid.reshape(len(values), -1, *size)
-    return InputMaps(grid[:, :-1], grid[:, -1:])
+        lag, far = limit_norm(mean - points[:, 0], LIMITS.lag)
+        channels.append(_along(axes, lag))
+        counts[Guard.LAG] = counts[Guard.LAG] + far if Guard.LAG in counts else far
+    values = torch.cat([*channels, velocity.norm(dim=-1, keepdim=True)], -1)
+    grid = values.new_zeros(len(values), values.shape[-1], control.size[0] * control.size[1])
+    grid[:, :, control.cells] = values.transpose(1, 2)
+    grid = grid.reshape(len(values), -1, *control.size)
+    return InputMaps(grid[:, :-1], grid[:, -1:], counts)
+
+
+def limit_norm(
+    vectors: Float[Tensor, "b p 3"], limit: float
+) -> tuple[Float[Tensor, "b p 3"], Int[Tensor, " b"]]:
+    """Shorten vectors that are longer than the limit, keeping their direction; return how many were, too."""
+    norm = vectors.norm(dim=-1, keepdim=True)
+    return vectors * (limit / norm.clamp_min(limit)), (norm > limit).sum((1, 2))
+
+
+def _along(axes: Float[Tensor, "b p 3 3"], vectors: Float[Tensor, "b p 3"]) -> Float[Tensor, "b p 3"]:
+    """Return the components of world vectors along axes given as columns."""
+    return (vectors[..., :, None] * axes).sum(-2)

@@ -5,9 +5,10 @@ what the network sees and predicts is mirrored: it learns from twice the motions
 """
 
 import torch
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool, Float
 from torch import Tensor
 
+from dsar.avatar.control_grid import ControlGrid
 from dsar.body.model import JOINT_NAMES
 from dsar.network import NetworkOutput
 
@@ -26,16 +27,9 @@ def mirror_motion(transforms: Float[Tensor, "*f j 4 4"]) -> Float[Tensor, "*f j 
 class Mirror:
     """The mirror images of an avatar's outputs."""
 
-    def __init__(
-        self, points: Float[Tensor, "p 3"], axes: Float[Tensor, "p 3 3"], cells: Int64[Tensor, " p"]
-    ) -> None:
-        """Pair each control point with the one nearest to its mirror image.
-
-        Args:
-            points: Control points at rest, metres.
-            axes: The axes of their offsets as columns.
-            cells: Their flat grid indices.
-        """
+    def __init__(self, control: ControlGrid) -> None:
+        """Pair each control point with the one nearest to its mirror image."""
+        points, axes, cells = control.points, control.axes, control.cells
         flip = _FLIP.to(points)
         nearest = [torch.cdist(chunk, points).argmin(1) for chunk in (points * flip).split(1024)]
         counterpart = torch.cat(nearest)

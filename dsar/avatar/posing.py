@@ -1,4 +1,4 @@
-"""From canonical to posed Gaussians: linear blend skinning with proper rotations (paper equations 1 and 3).
+"""From canonical to posed Gaussians: linear blend skinning with proper rotations.
 
 The blend of bone transforms moves the centres; its nearest rotation (polar factor) rotates the
 covariances and the harmonics, in rendering and in every export alike. Neither depends on anything
@@ -23,7 +23,7 @@ _ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
 def pose_gaussians(
     canonical: tuple[Tensor, Tensor, Tensor, Tensor, Tensor], blended: Float[Tensor, "b n 3 4"]
 ) -> list[Gaussians]:
-    """Return one posed set of Gaussians per batch entry from canonical fields (batch of 1 or b).
+    """Return one posed set of Gaussians per batch entry from canonical fields of 1 or b (paper equation 3).
 
     Harmonics are rotated with the surface, which is the same as evaluating them along the view
     direction turned back into the canonical frame.

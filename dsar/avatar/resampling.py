@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dsar.avatar.driving import find_jumps
+from dsar.avatar.driving import DrivingSignal
 from dsar.body.skinning import forward_kinematics
 from dsar.errors import MotionError
 from dsar.geometry.frame_rates import exact_rate
@@ -31,7 +31,7 @@ class RolloutTime:
     """How much of the way to the next frame has passed, in [0, 1); 0: it is the rollout's own frame."""
 
 
-def locate_frames(body: Body, motion: Motion, delivered: Motion) -> list[RolloutTime]:
+def locate_frames(signal: DrivingSignal, delivered: Motion) -> list[RolloutTime]:
     """Return where each frame of a delivery lies in the rollout of a motion; both begin together.
 
     Times are exact: 24 and 24000/1001 frames a second meet 30 where they truly do. Across a jump of the body
@@ -40,24 +40,26 @@ def locate_frames(body: Body, motion: Motion, delivered: Motion) -> list[Rollout
     Raises:
         MotionError: the delivery goes on a frame of the rollout or more after the last.
     """
-    ratio, last = exact_rate(motion.fps) / exact_rate(delivered.fps), len(motion) - 1
+    ratio, last = exact_rate(signal.fps) / exact_rate(delivered.fps), len(signal) - 1
     if (len(delivered) - 1) * ratio >= last + 1:
         raise MotionError(
-            f"motion {motion.name}: expected a delivery of its {len(motion) / motion.fps:g} s, found "
+            f"motion {signal.name}: expected a delivery of its {len(signal) / signal.fps:g} s, found "
             f"{len(delivered)} frames at {delivered.fps:g} a second: resample the same motion for both"
         )
-    jumps = set(find_jumps(_transforms(body, motion), body.joints[0], motion.fps))
-    return [_place(frame * ratio, jumps) for frame in range(len(delivered))]
+    return [_locate(frame * ratio, signal.jumps) for frame in range(len(delivered))]
 
 
 def delivery_transforms(
-    body: Body, motion: Motion, delivered: Motion, times: list[RolloutTime]
+    body: Body, signal: DrivingSignal, delivered: Motion, times: list[RolloutTime]
 ) -> Float[Tensor, "f j 4 4"]:
     """Return T_world_rest of every joint at given times of a rollout: its own where they are its frames."""
-    transforms = _transforms(body, delivered)
-    own = torch.tensor([time.fraction == 0 for time in times], device=transforms.device)
-    steps = torch.tensor([time.step for time in times], device=transforms.device)
-    transforms[own] = _transforms(body, motion)[steps[own]]
+    own = torch.tensor([time.fraction == 0 for time in times], device=signal.transforms.device)
+    steps = torch.tensor([time.step for time in times], device=signal.transforms.device)
+    if own.all():
+        return signal.transforms[steps]
+    poses = delivered.rotations.to(body.joints), delivered.translations.to(body.joints)
+    transforms = forward_kinematics(body, *poses)
+    transforms[own] = signal.transforms[steps[own]]
     return transforms
 
 
@@ -72,13 +74,9 @@ def interpolate_residuals(first: NetworkOutput, second: NetworkOutput, fraction:
     return NetworkOutput(offset, torch.lerp(first.appearance, second.appearance, fraction), ())
 
 
-def _place(time: Fraction, jumps: Collection[int]) -> RolloutTime:
+def _locate(time: Fraction, jumps: Collection[int]) -> RolloutTime:
     """Return where a time lies, in frames of the rollout."""
     step, fraction = int(time), time % 1
     if step + 1 in jumps:
         step, fraction = step + round(fraction), Fraction(0)
     return RolloutTime(step, float(fraction))
-
-
-def _transforms(body: Body, motion: Motion) -> Float[Tensor, "f j 4 4"]:
-    return forward_kinematics(body, motion.rotations.to(body.joints), motion.translations.to(body.joints))

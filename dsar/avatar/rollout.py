@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dsar.avatar.avatar import Avatar
+from dsar.avatar.player import Player
 from dsar.avatar.resampling import (
     RolloutTime,
     copy_residuals,
@@ -20,7 +21,6 @@ from dsar.errors import MotionError
 from dsar.geometry.camera_paths import START_FRAME
 from dsar.geometry.frame_rates import same_rate
 from dsar.network import STREAMS, NetworkOutput, Stream
-from dsar.network.session import InferenceSession
 from dsar.types import Binding, Gaussians, GaussianSequence, Motion
 
 
@@ -68,14 +68,15 @@ def roll_out(
         )
     numbers = sorted(set(numbers))
     wanted = [number - START_FRAME for number in numbers]
-    times = locate_frames(avatar.body, motion, delivered)
-    poses = delivery_transforms(avatar.body, motion, delivered, times)[wanted]
+    signal = avatar.driving_signal(motion)
+    times = locate_frames(signal, delivered)
+    poses = delivery_transforms(avatar.body, signal, delivered, times)[wanted]
     times = [times[frame] for frame in wanted]
     return GaussianSequence(
         frame_numbers=numbers,
         fps=avatar.fps if same_rate(delivered.fps, avatar.fps) else delivered.fps,
         num_gaussians=avatar.num_gaussians,
-        produce=lambda: _produce(avatar, motion, times, poses, streams),
+        produce=lambda: _deliver(Player(avatar, signal, streams=streams), times, poses),
         provenance={"motion": motion.name, **(provenance or {})},
         binding=_bind(avatar, poses),
     )
@@ -83,10 +84,10 @@ def roll_out(
 
 def _bind(avatar: Avatar, poses: Float[Tensor, "f j 4 4"]) -> Binding:
     """Return how the avatar hangs on its body where that carries it (T_world_rest of its joints)."""
-    width = avatar.atlas_size[1]
+    width, height = avatar.atlas_size[1], len(avatar.charts[0].rows)
     rows, columns = avatar.texels // width, avatar.texels % width
-    # The body's chart is a square; charts of garments lie below it.
-    uv = torch.stack([(columns + 0.5) / width, 1 - (rows + 0.5) / width], -1)
+    # The body's chart fills its texture; charts of garments lie below it.
+    uv = torch.stack([(columns + 0.5) / width, 1 - (rows + 0.5) / height], -1)
     # Writers work on the CPU, whatever the avatar does.
     return Binding(
         body=avatar.body.to(device="cpu"),
@@ -105,7 +106,7 @@ def template_sequence(sequence: GaussianSequence, avatar: Avatar, motion: Motion
     @torch.no_grad()
     def produce() -> Iterator[Gaussians]:
         for number in sequence.frame_numbers:
-            yield avatar.gaussians(signal[[number - START_FRAME]], None)[0]
+            yield avatar.gaussians(signal.windows[[number - START_FRAME]], None)[0]
 
     return dataclasses.replace(sequence, produce=produce)
 
@@ -117,35 +118,29 @@ def network_outputs(
 
     On a GPU an output lasts until the next is asked for.
     """
-    signal = avatar.driving_signal(motion)
-    session = InferenceSession(avatar.network, streams, torch.bfloat16 if signal.is_cuda else None)
-    for frame in range(len(signal)):
-        with torch.no_grad():
-            motion_window = signal[[frame]]
-            output = session.step(*avatar.standardize(avatar.input_maps(motion_window, avatar.fps)))
-        yield motion_window, output
+    player = Player(avatar, avatar.driving_signal(motion), streams=streams)
+    for _ in range(len(motion)):
+        frame = player.forward_frame()
+        yield frame.motion_window, frame.output
 
 
-def _produce(
-    avatar: Avatar,
-    motion: Motion,
-    times: Sequence[RolloutTime],
-    poses: Float[Tensor, "f j 4 4"],
-    streams: Collection[Stream],
+def _deliver(
+    player: Player, times: Sequence[RolloutTime], transforms: Float[Tensor, "f j 4 4"]
 ) -> Iterator[Gaussians]:
-    """Yield the Gaussians at ascending times of a rollout; `poses` are those of the body at each."""
-    steps = network_outputs(avatar, motion, streams=streams)
-    step, before, (motion_window, output) = 0, None, next(steps)
-    for time, pose in zip(times, poses, strict=True):
-        while step < time.step + (time.fraction > 0):
-            before = copy_residuals(output)
-            # After the last step its residuals stay.
-            step, (motion_window, output) = step + 1, next(steps, (motion_window, output))
+    """Yield the Gaussians at ascending times of a rollout; `transforms` are the body's, time by time."""
+    avatar, last = player.avatar, len(player.signal) - 1
+    newest, before = player.forward_frame(), None
+    for time, pose in zip(times, transforms, strict=True):
+        while newest.number < min(time.step + (time.fraction > 0), last):
+            before = copy_residuals(newest.output)
+            newest = player.forward_frame()
         with torch.no_grad():
-            if before is None or time.fraction == 0:
-                gaussians = avatar.gaussians(motion_window, output)[0]
+            if time.fraction == 0:
+                gaussians = avatar.gaussians(newest.motion_window, newest.output)[0]
             else:
-                gaussians = avatar.gaussians(
-                    pose[None, None], interpolate_residuals(before, output, time.fraction)
-                )[0]
+                # After the last frame its residuals stay.
+                residuals = newest.output
+                if before is not None and time.step < newest.number:
+                    residuals = interpolate_residuals(before, residuals, time.fraction)
+                gaussians = avatar.gaussians(pose[None, None], residuals)[0]
         yield gaussians

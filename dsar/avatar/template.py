@@ -50,7 +50,7 @@ class GaussianParameters(nn.Module):
         """Return canonical means, rotations, scales, opacities and harmonics, batch first.
 
         Without residuals it is the template itself, in a batch of one. Residuals are added to the raw
-        values: metres to means, then quaternion 4, log-scale 3, logit 1, harmonics 3k (equation 2).
+        values: metres to means, then quaternion 4, log-scale 3, logit 1, harmonics 3k (paper equation 2).
         """
         quaternions, log_scales = self.quaternions[None], self.log_scales[None]
         logits, harmonics, means = self.opacity_logits[None], self.harmonics[None], self.means[None]

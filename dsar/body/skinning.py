@@ -39,19 +39,19 @@ def forward_kinematics(
 
 
 def blend_transforms(
-    weights: Float[Tensor, "n j"], transforms: Float[Tensor, "j 4 4"]
-) -> Float[Tensor, "n 3 4"]:
+    weights: Float[Tensor, "n j"], transforms: Float[Tensor, "*b j 4 4"]
+) -> Float[Tensor, "*b n 3 4"]:
     """Return the weighted mean of joint transforms per point (rows of `weights` sum to 1).
 
     The left 3x3 block is not a rotation where joints disagree; `nearest_rotation` makes it one.
     """
-    return (weights @ transforms[:, :3].flatten(1)).unflatten(1, (3, 4))
+    return (weights @ transforms[..., :3, :].flatten(-2)).unflatten(-1, (3, 4))
 
 
 def skin_points(
     points: Float[Tensor, "n 3"], weights: Float[Tensor, "n j"], transforms: Float[Tensor, "j 4 4"]
 ) -> Float[Tensor, "n 3"]:
-    """Return rest points (metres) carried by T_world_rest of the joints, blended by their weights."""
+    """Return rest points, metres, carried by T_world_rest of the joints, blended (paper equation 1)."""
     blended = blend_transforms(weights, transforms)
     return (blended[:, :, :3] @ points[:, :, None]).squeeze(-1) + blended[:, :, 3]
 

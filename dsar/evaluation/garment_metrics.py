@@ -124,7 +124,7 @@ def measure_garment(
     truth = torch.from_numpy(capture.garment(sequence))
     faces = torch.from_numpy(capture.garment_faces(sequence))
     rows = avatar.texels[garment] // avatar.atlas_size[1]
-    lowest, hem = (rows == rows.max()).nonzero().squeeze(1), hem_loop(truth[0], faces)
+    lowest, hem = (rows == avatar.garments[-1].rows[-1]).nonzero().squeeze(1), hem_loop(truth[0], faces)
     motion = capture.motions[sequence]
     rollout = roll_out(avatar, motion)
     sequences = {"predicted": rollout, "template": template_sequence(rollout, avatar, motion)}

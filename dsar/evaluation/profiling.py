@@ -93,7 +93,7 @@ def time_rollout(avatar: Avatar, capture: Capture, sequence: str, frames: int = 
     times: dict[str, list[float]] = defaultdict(list)
     for frame in range(_WARM_UP + frames):
         start = read_clock()
-        motion_window = signal[[frame % len(signal)]]
+        motion_window = signal.windows[[frame % len(signal)]]
         maps, magnitude = avatar.standardize(avatar.input_maps(motion_window, avatar.fps))
         network_start = read_clock()
         step = partial(session.step, maps, magnitude)

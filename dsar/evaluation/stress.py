@@ -130,7 +130,7 @@ def run_twin(avatar: Avatar, motion: Motion, start: int = 30) -> CaseVerdict:
             memory, offsets = state.memory[1], state.offsets[1]
             memory.copy_(torch.randn(memory.shape, generator=generator) * memory.square().mean().sqrt())
             offsets.add_(_NOISE * torch.randn(offsets.shape, generator=generator))
-        motion_window = signal[[frame]]
+        motion_window = signal.windows[[frame]]
         output, state, _ = avatar.forward_frame(motion_window.expand(2, -1, -1, -1, -1), state)
         if frame >= start:
             apart.append(_distance(*_at_control_points(avatar, output)))
@@ -220,7 +220,7 @@ def _offsets(avatar: Avatar, motion: Motion) -> Iterator[Float[Tensor, "p 3"]]:
 
 
 def _at_control_points(avatar: Avatar, output: NetworkOutput) -> Float[Tensor, "b p 3"]:
-    return output.offset.flatten(2)[:, :, avatar.control_cells].transpose(1, 2)
+    return avatar.gather_control_points(output.offset)
 
 
 def _distance(one: Float[Tensor, "*s p 3"], other: Float[Tensor, "*s p 3"]) -> Float[Tensor, "*s"]:

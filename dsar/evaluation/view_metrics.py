@@ -52,7 +52,7 @@ def evaluate_sequence(
     for number, gaussians in roll_out(avatar, motion, streams=streams):
         frame = number - START_FRAME
         if frame % stride == 0:
-            template = avatar.gaussians(signal[[frame]], None)[0]
+            template = avatar.gaussians(signal.windows[[frame]], None)[0]
             for index in capture.cameras_with_image(sequence, frame):
                 camera, truth = capture.cameras[index], true_view(capture, sequence, frame, index)
                 image = render_white(gaussians, camera)

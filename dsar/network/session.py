@@ -57,7 +57,7 @@ class InferenceSession:
         self._static_term = network.encoder.static_term()
         # Where features never change, keys and values do not either, and the newest row needs no others.
         cacheable, all_rows = network.encoder.features_cacheable, network.readout.reads_all_rows
-        self._attend = self._attend_cached if cacheable else self._attend_recomputed
+        self._features_cacheable = cacheable
         levels = len(network.encoder.cached_channels()) - (cacheable and not all_rows)
         self._index = RingIndex(config.window, device)
         self._frames = [RingBuffer(self._index) for _ in range(levels)]
@@ -138,7 +138,8 @@ class InferenceSession:
         precomputed = network.encoder.precompute(frame, self._static_term)
         motion = network.embed_motion(magnitude) if network.motion_embedding is not None else None
         positions = self._positions.select(self._index.newest)
-        window, aggregate, newest = self._attend(precomputed, motion, offsets, positions)
+        attend = self._attend_cached if self._features_cacheable else self._attend_recomputed
+        window, aggregate, newest = attend(precomputed, motion, offsets, positions)
         features = window.add_offset_features(newest)
         hidden = aggregate if network.bank is None else self._remember(aggregate, features)
         output = network.decode(window, hidden, positions)

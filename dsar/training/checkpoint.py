@@ -30,7 +30,7 @@ from safetensors.torch import load as load_tensors
 from torch import Tensor
 
 from dsar.avatar.avatar import Avatar
-from dsar.body.atlas import Atlas
+from dsar.avatar.charts import Atlas, decode_charts, encode_charts
 from dsar.body.model import PARENTS
 from dsar.config import EMBEDDED, TrainConfig, config_from_json
 from dsar.errors import CheckpointError, ConfigError
@@ -234,7 +234,8 @@ def _avatar(tensors: dict[str, Tensor], config: TrainConfig, path: Path) -> Avat
     body = Body(parents=PARENTS, **{name: tensors[f"body_{name}"] for name in _BODY})
     height, width = (int(size) for size in tensors.pop("atlas_size"))
     fields = ("positions", "weights", "frames", "tangents", "hidden")
-    atlas = Atlas(height, width, tensors["texels"], *(tensors[f"texel_{name}"] for name in fields))
+    charts = decode_charts(tensors.pop("charts", None), height, width)
+    atlas = Atlas(charts, width, tensors["texels"], *(tensors[f"texel_{name}"] for name in fields))
     avatar = Avatar(body, atlas, config.model, float(tensors.pop("fps")))
     expected = {name: tuple(value.shape) for name, value in avatar.state_dict().items()}
     found = {name: tuple(value.shape) for name, value in tensors.items()}
@@ -252,6 +253,7 @@ def describe_avatar(avatar: Avatar) -> dict[str, Tensor]:
     """Return what `load_checkpoint` needs besides the avatar's parameters to rebuild it."""
     return {
         "atlas_size": torch.tensor(avatar.atlas_size),
+        "charts": encode_charts(avatar.charts),
         "fps": torch.tensor(avatar.fps, dtype=torch.float64),
     }
 

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from dsar.avatar.driving import DrivingSignal
 from dsar.avatar.input_maps import InputMaps
 from dsar.avatar.mirror import Mirror, mirror_motion
 from dsar.config import TrainConfig
@@ -57,7 +58,7 @@ class ChunkTrainer:
         config: TrainConfig,
         capture: Capture,
         state: TrainingState,
-        signals: Mapping[str, Float[Tensor, "_ t j 4 4"]],
+        signals: Mapping[str, DrivingSignal],
         lpips: nn.Module | None,
     ) -> None:
         """Prepare to train.
@@ -73,11 +74,7 @@ class ChunkTrainer:
         self.signals, self.lpips = signals, lpips
         self.loader = TargetLoader(capture, max(1, (os.cpu_count() or 1) // config.workers))
         avatar = state.avatar
-        self.mirror = (
-            Mirror(avatar.control_points, avatar.control_axes, avatar.control_cells)
-            if config.schedule.mirrored_fraction
-            else None
-        )
+        self.mirror = Mirror(avatar.control) if config.schedule.mirrored_fraction else None
 
     def backward_template(self, rng: np.random.Generator, reduction: int) -> UpdateMetrics:
         """Back-propagate views of the template in the shapes it has in still frames."""
@@ -89,7 +86,7 @@ class ChunkTrainer:
         loss, mse = count * rest.loss(self.avatar, self.config.loss), torch.zeros(())
         for index, (name, frame), frame_targets in zip(chosen, frames, targets, strict=True):
             output = rest.output(self.avatar, int(index))
-            gaussians = self.avatar.gaussians(self.signals[name][[frame]], output)[0]
+            gaussians = self.avatar.gaussians(self.signals[name].windows[[frame]], output)[0]
             view = self._views(rng, gaussians, frame_targets, reduction)
             loss, mse = loss + view[0], mse + view[1]
         return self._backward(loss, mse, count)
@@ -142,7 +139,9 @@ class ChunkTrainer:
         """Step every rollout by one frame, some of them afresh."""
         state = self.state
         state.network = state.network.restart(torch.tensor(fresh))
-        driving_window = motion_window = torch.stack([self.signals[c.sequence][c.frame] for c in cursors])
+        driving_window = motion_window = torch.stack(
+            [self.signals[c.sequence].windows[c.frame] for c in cursors]
+        )
         mirrored = torch.tensor([cursor.mirrored for cursor in cursors])
         if self.mirror is not None:
             driving_window = torch.where(
@@ -184,7 +183,7 @@ class ChunkTrainer:
 
     def _spatial(self, output: NetworkOutput) -> Tensor:
         offsets = self.avatar.gather_control_points(output.offset)
-        return self.config.loss.spatial * spatial_loss(offsets, self.avatar.surface_edges)
+        return self.config.loss.spatial * spatial_loss(offsets, self.avatar.control.edges)
 
     def _registered_distance(self, step: _Step) -> Tensor:
         """Return the mean distance, cm, to the registered maps; frames without one count as reached."""
@@ -212,7 +211,7 @@ class ChunkTrainer:
             history.magnitudes,
             [cursor.age for cursor in step.cursors],
             avatar.network.occupied,
-            avatar.control_cells,
+            avatar.control.cells,
             self.config.loss,
         )
 
@@ -227,5 +226,6 @@ class ChunkTrainer:
         return UpdateMetrics(float(loss.detach()), float(mse) / count if mse is not None else None)
 
     def _first_not_finite(self) -> str:
-        named = [*self.avatar.named_parameters(), *self.state.state_dict().items()]
+        state = {f"state.{name}": value for name, value in self.state.rollout_tensors().items()}
+        named = [*self.avatar.named_parameters(), *state.items()]
         return next((name for name, value in named if not value.isfinite().all()), "the rendered image")

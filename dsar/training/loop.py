@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor, nn
+from torch import nn
 
 from dsar.atomic_files import write_text_atomically
 from dsar.avatar.avatar import Avatar
+from dsar.avatar.driving import DrivingSignal
 from dsar.avatar.rest_frames import find_rest_frames
 from dsar.config import TrainConfig, config_to_json, with_absolute_paths
 from dsar.data.captures.formats import capture_of
@@ -187,12 +187,12 @@ def training_clips(capture: Capture) -> dict[str, range]:
 
 def rest_frames(
     capture: Capture,
-    signals: Mapping[str, Float[Tensor, "_ t j 4 4"]],
+    signals: Mapping[str, DrivingSignal],
     clips: Mapping[str, range],
     fps: float,
 ) -> list[tuple[str, int]]:
     """Return sequence and frame of the near-rest training frames that the template is fitted to."""
-    transforms = {name: signals[name][: clip.stop, 0] for name, clip in clips.items()}
+    transforms = {name: signals[name].transforms[: clip.stop] for name, clip in clips.items()}
     per_sequence = max(1, -(-STILL_FRAMES // len(clips)))
     return find_rest_frames(transforms, fps, STILL_FRAMES, per_sequence, capture.cameras_with_image)
 

@@ -13,8 +13,13 @@ from torch import Tensor
 OLDEST_VERSION = 3
 """Oldest format that is read."""
 AVATAR_NAMES = {
-    "cells": "control_cells",
-    "speed_scale": "magnitude_scale",
+    "cells": "control.cells",
+    "control_points": "control.points",
+    "control_weights": "control.weights",
+    "control_frames": "control.frames",
+    "map_mean": "statistics.map_mean",
+    "map_scale": "statistics.map_scale",
+    "speed_scale": "statistics.magnitude_scale",
     "pose_mean": "principal_poses.mean",
     "pose_basis": "principal_poses.basis",
     "pose_deviation": "principal_poses.deviation",

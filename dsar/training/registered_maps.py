@@ -50,7 +50,7 @@ class RegisteredMaps:
             name: frozenset(frame for frame in clip if not capture.cameras_with_image(name, frame))
             for name, clip in registered.items()
         }
-        return cls(registered, len(avatar.control_cells), unseen)
+        return cls(registered, len(avatar.control.cells), unseen)
 
     @property
     def longest(self) -> int:

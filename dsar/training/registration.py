@@ -14,7 +14,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dsar.avatar.avatar import Avatar, blend_bone_transforms
+from dsar.avatar.avatar import Avatar, blend_transforms
+from dsar.avatar.driving import DrivingSignal
 from dsar.config import TrainConfig
 from dsar.geometry.cameras import project
 from dsar.raster import rasterize, reduced_dilation
@@ -59,7 +60,7 @@ class Registration:
         avatar: Avatar,
         rest: RestOffsets,
         maps: RegisteredMaps,
-        signals: Mapping[str, Float[Tensor, "_ t j 4 4"]],
+        signals: Mapping[str, DrivingSignal],
     ) -> None:
         """Prepare to fit this worker's frames of `maps`.
 
@@ -88,7 +89,7 @@ class Registration:
     def fit(self, name: str, frame: int) -> UpdateMetrics | None:
         """Fit the map of a frame; those before it are fitted. Cloth that no camera saw stays as it was."""
         rng = np.random.default_rng([self.seed, self.order.index(name), frame])
-        motion_window = self.signals[name][[frame]]
+        motion_window = self.signals[name].windows[[frame]]
         guesses, fast = self._guesses(motion_window, name, frame)
         points = self._posed(motion_window, guesses[0])
         view = functools.cache(functools.partial(self._view, name, frame, points=points))
@@ -150,11 +151,11 @@ class Registration:
         """Return the offsets of cloth that moves on through the world as it did before this frame."""
         avatar, garment, signal = self.avatar, self.garment, self.signals[name]
         past = self.maps.offsets[name]
-        newest, older = (self._posed(signal[[f]], past[f, garment]) for f in (frame - 1, frame - 2))
+        newest, older = (self._posed(signal.windows[[f]], past[f, garment]) for f in (frame - 1, frame - 2))
         moved = newest + self._smooth(newest - older)
-        blended = blend_bone_transforms(avatar.control_weights[garment], motion_window[:, :1])[0, 0]
+        blended = blend_transforms(avatar.control.weights[garment], motion_window[:, :1])[0, 0]
         points = torch.linalg.solve(blended[..., :3], (moved - blended[..., 3])[..., None])[..., 0]
-        return (avatar.control_axes[garment] * (points - avatar.control_points[garment])[..., None]).sum(1)
+        return (avatar.control.axes[garment] * (points - avatar.control.points[garment])[..., None]).sum(1)
 
     def _compare(
         self,
@@ -176,7 +177,7 @@ class Registration:
         return loss + ROUGHNESS * self._roughness(offset), mse
 
     def _roughness(self, offset: Float[Tensor, "g 3"]) -> Float[Tensor, ""]:
-        return spatial_loss(self.avatar.scatter_garment_points(offset[None]), self.avatar.surface_edges)
+        return spatial_loss(self.avatar.scatter_garment_points(offset[None]), self.avatar.control.edges)
 
     def _view(self, name: str, frame: int, camera: int, points: Float[Tensor, "g 3"]) -> tuple[Target, float]:
         """Return a view of the garment around its points in the world, and its share of the person's view."""
@@ -198,9 +199,9 @@ class Registration:
     def _smooth(self, vectors: Float[Tensor, "g 3"]) -> Float[Tensor, "g 3"]:
         """Return the mean of each control point of the garment and its neighbours."""
         avatar = self.avatar
-        spread = torch.zeros(len(avatar.control_cells), 4)
+        spread = torch.zeros(len(avatar.control.cells), 4)
         spread[self.garment] = torch.cat([vectors, torch.ones(len(vectors), 1)], 1)
         total = spread.clone()
-        for a, b in (avatar.surface_edges.T, avatar.surface_edges.T.flip(0)):
+        for a, b in (avatar.control.edges.T, avatar.control.edges.T.flip(0)):
             total.index_add_(0, a, spread[b])
         return (total[:, :3] / total[:, 3:].clamp_min(1))[self.garment]

@@ -9,7 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from dsar.avatar.avatar import Avatar, find_surface_edges
+from dsar.avatar.avatar import Avatar
+from dsar.avatar.control_grid import find_surface_edges
 from dsar.config import LossConfig
 from dsar.network import NetworkOutput
 from dsar.training.losses import CENTIMETRES, spatial_loss
@@ -30,9 +31,7 @@ class RestOffsets(nn.Module):
         self._garment = avatar.garment_texels()
         self._chart = avatar.texel_positions[self._garment]
         cells = avatar.texels[self._garment]
-        self._edges = (
-            find_surface_edges(cells, avatar.atlas_size, self._chart) if len(cells) else cells.reshape(0, 2)
-        )
+        self._edges = find_surface_edges(cells, avatar.atlas_size, self._chart, avatar.charts)
 
     def output(self, avatar: Avatar, index: int) -> NetworkOutput:
         """Return the output that gives the garment the shape it has in one of the frames."""
@@ -50,6 +49,6 @@ class RestOffsets(nn.Module):
         if not len(self._garment):
             return self.offsets.new_zeros(())
         moved = (avatar.template.means[self._garment] - self._chart)[None]
-        together = spatial_loss(avatar.scatter_garment_points(self.offsets), avatar.surface_edges)
+        together = spatial_loss(avatar.scatter_garment_points(self.offsets), avatar.control.edges)
         pull = (self.offsets * CENTIMETRES).square().sum(-1).mean()
         return config.shape * spatial_loss(moved, self._edges) + config.spatial * together + PULL * pull

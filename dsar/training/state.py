@@ -71,18 +71,22 @@ class TrainingState:
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return all of it as named tensors; the first part of a name says of what it is."""
-        network = {"fresh": self.network.fresh, "motion": self.network.motion}
-        network |= {"offsets": self.network.offsets, "memory": self.network.memory}
-        network |= {f"window.{i}": level for i, level in enumerate(self.network.window)}
-        rollouts = network | self.history.state_dict()
-        rollouts |= {f"cursors.{name}": rows for name, rows in self.rollouts.state_dict().items()}
         parts = {name: _moments(optimizer) for name, optimizer in self.optimizers.items()}
-        parts |= {"avatar": self.avatar.state_dict(), "rollouts": rollouts}
+        parts |= {"avatar": self.avatar.state_dict(), "rollouts": self.rollout_tensors()}
         parts["registration"] = self.registered.state_dict() | {"rest": self.rest.offsets.detach()}
         tensors = {f"{part}.{name}": value for part, named in parts.items() for name, value in named.items()}
         tensors["step"] = torch.tensor(self.step)
         tensors["progress"] = torch.tensor(self.progress, dtype=torch.float64)
         return tensors
+
+    def rollout_tensors(self) -> dict[str, Tensor]:
+        """Return where the rollouts stand, and what the network and the temporal losses remember of them."""
+        network, cursors = self.network, self.rollouts.state_dict()
+        tensors = {"fresh": network.fresh, "motion": network.motion}
+        tensors |= {"offsets": network.offsets, "memory": network.memory}
+        tensors |= {f"window.{i}": level for i, level in enumerate(network.window)}
+        tensors |= {f"cursors.{sequence}": rows for sequence, rows in cursors.items()}
+        return tensors | self.history.state_dict()
 
     def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
         """Restore what `state_dict` returned, or the parts of it that are given.

@@ -15,7 +15,7 @@ _UNIT = 1e-3
 """How far a quaternion's length may be from 1."""
 
 
-def check_name(what: str, name: str) -> None:
+def check_name(role: str, name: str) -> None:
     """Check that a name is a valid identifier: it becomes a USD prim, an EXR view and a part of file names.
 
     Raises:
@@ -23,18 +23,18 @@ def check_name(what: str, name: str) -> None:
     """
     if not _IDENTIFIER.fullmatch(name):
         raise ExportError(
-            f"{what}: expected letters, digits and _ (no leading digit), found {name!r}: rename it"
+            f"{role}: expected letters, digits and _ (no leading digit), found {name!r}: rename it"
         )
 
 
-def check_file_name(what: str, name: str) -> None:
+def check_file_name(role: str, name: str) -> None:
     """Check that a name can be the first part of file names.
 
     Raises:
         ExportError: It is empty or holds a slash.
     """
     if not name or any(separator in name for separator in "/\\"):
-        raise ExportError(f"{what}: expected a name without / or \\, found {name!r}: rename it")
+        raise ExportError(f"{role}: expected a name without / or \\, found {name!r}: rename it")
 
 
 def check_cameras(cameras: Sequence[Camera]) -> None:
@@ -122,7 +122,7 @@ def _check_ranges(frame: int, gaussians: Gaussians) -> None:
     if not len(gaussians):
         return
     lengths, scales, opacities = gaussians.rotations.norm(dim=-1), gaussians.scales, gaussians.opacities
-    for what, values, low, high in (
+    for quantity, values, low, high in (
         ("opacities", opacities, 0.0, 1.0),
         ("scales", scales, 0.0, float("inf")),
         ("lengths of quaternions", lengths, 1 - _UNIT, 1 + _UNIT),
@@ -130,6 +130,6 @@ def _check_ranges(frame: int, gaussians: Gaussians) -> None:
         least, most = float(values.min()), float(values.max())
         if not low <= least <= most <= high:
             raise ExportError(
-                f"frame {frame}: expected {what} from {low:g} to {high:g}, found {least:g} to {most:g}: pass "
-                "the physical values that `Gaussians` documents"
+                f"frame {frame}: expected {quantity} from {low:g} to {high:g}, found {least:g} to {most:g}: "
+                "pass the physical values that `Gaussians` documents"
             )

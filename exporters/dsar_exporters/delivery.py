@@ -33,7 +33,7 @@ class Output(Protocol):
         """The file that stands for what is written, or the folder of a sequence of files."""
         ...
 
-    def opened(self, sequence: GaussianSequence) -> AbstractContextManager[Sink]:
+    def open_sink(self, sequence: GaussianSequence) -> AbstractContextManager[Sink]:
         """Check everything that can be checked without a frame, then take frames.
 
         Leaving without an error puts the files in their place; leaving with one leaves there what was there.
@@ -44,7 +44,7 @@ class Output(Protocol):
         """Return how large the files will be, about, from the first frame."""
         ...
 
-    def written(self) -> Sequence[Path]:
+    def written_files(self) -> Sequence[Path]:
         """Return the files of the last pass."""
         ...
 
@@ -70,9 +70,9 @@ class _TimedSink:
 
     def open(self, sequence: GaussianSequence) -> AbstractContextManager[Sink]:
         """Open the output and return what closes it."""
-        self._opened = self.output.opened(sequence)
-        self._sink = self._opened.__enter__()
-        return self._opened
+        self._closing = self.output.open_sink(sequence)
+        self._sink = self._closing.__enter__()
+        return self._closing
 
     def write(self, frame: int, gaussians: Gaussians) -> None:
         """Write a frame."""
@@ -82,7 +82,7 @@ class _TimedSink:
     def close(self) -> None:
         """Put the files in their place."""
         with self._timed(), naming_storage_errors(self.output.path):
-            self._opened.__exit__(None, None, None)
+            self._closing.__exit__(None, None, None)
 
     @contextmanager
     def _timed(self) -> Iterator[None]:
@@ -140,7 +140,7 @@ def _close(sinks: Sequence["_TimedSink"]) -> list[Delivery]:
         except DsarError as error:
             errors.append(error)
             continue
-        files = sink.output.written()
+        files = sink.output.written_files()
         size = sum(file.stat().st_size for file in files)
         delivery = Delivery(sink.output.path, len(files), size, sink.seconds)
         rate = size / _MEGA / max(delivery.seconds, 1e-9)

@@ -26,7 +26,7 @@ def display_image(output: RenderOutput) -> UInt8[np.ndarray, "h w 3"]:
     return _to_uint8(output.color.detach().cpu().numpy())
 
 
-def over(output: RenderOutput, background: float) -> RenderOutput:
+def composite_over(output: RenderOutput, background: float) -> RenderOutput:
     """Return an image that was rendered without a background over a grey one, display-referred."""
     return dataclasses.replace(output, color=output.color + (1 - output.alpha[..., None]) * background)
 

@@ -1,93 +1,24 @@
 """Pictures: what one camera sees of one frame while its shutter is open."""
 
 import dataclasses
-import hashlib
-import importlib.metadata
-import json
 from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
 from dsar.color import linear_from_srgb, srgb_from_linear
-from dsar.errors import ConfigError
 from dsar.geometry.camera_paths import CameraPath
 from dsar.raster import Output, rasterize
 from dsar.types import Camera, Picture, RenderOutput
-from dsar_render.aovs import AOVS, RASTER_OUTPUTS, TimeSample, make_aovs, part_coverage
+from dsar_render.aovs import RASTER_OUTPUTS, TimeSample, make_aovs, part_coverage
 from dsar_render.deep import sample_deep
 from dsar_render.labels import Labels
+from dsar_render.settings import RenderSettings
 from dsar_render.triplets import FrameTriplet
 
 _MIN_ALPHA = 1e-6
 """Below this coverage a colour has no digits left."""
-
-
-@dataclass(frozen=True)
-class RenderSettings:
-    """What a picture is made of, besides the frame and the camera."""
-
-    aovs: tuple[str, ...] = ("rgba", "Z")
-    """Output variables, some of `AOVS`, in the order in which they are listed."""
-    deep: bool = False
-    """Whether samples at their depths are wanted, too."""
-    deep_max_samples: int = 32
-    """Samples a pixel at most."""
-    motion_samples: int = 1
-    """Images that are averaged over the shutter's time."""
-    shutter: tuple[float, float] = (0.0, 0.0)
-    """When it opens and closes, in frames from the frame's own time, within -1 to 1."""
-    overscan: int = 0
-    """Pixels beyond each side of the image."""
-
-    def __post_init__(self) -> None:
-        """Check the settings against each other."""
-        opens, closes = self.shutter
-        unknown = [name for name in self.aovs if name not in AOVS]
-        if unknown or not self.aovs:
-            raise ConfigError(
-                f"--aov: expected some of {', '.join(AOVS)}, found {', '.join(unknown) or 'none'}"
-            )
-        if not -1 <= opens <= closes <= 1:
-            raise ConfigError(
-                "--shutter: expected opening and closing times from -1 to 1 frames, found "
-                f"{opens:g} {closes:g}"
-            )
-        if self.motion_samples < 1 or self.deep_max_samples < 1 or self.overscan < 0:
-            raise ConfigError(
-                "--motion-samples and --deep-max-samples start at 1, --overscan at 0; found "
-                f"{self.motion_samples}, {self.deep_max_samples} and {self.overscan}"
-            )
-        if self.motion_samples > 1 and opens == closes:
-            raise ConfigError(
-                f"--motion-samples {self.motion_samples}: the shutter is never open; give it a time, such as "
-                "--shutter -0.25 0.25"
-            )
-        if self.deep and self.motion_samples > 1:
-            raise ConfigError(
-                "--deep: a sample has one depth, and an open shutter would blur it; "
-                "leave --motion-samples out"
-            )
-        if self.deep and any(self.times):
-            raise ConfigError(
-                f"--deep: samples are of the frame's own time, and --shutter {opens:g} {closes:g} takes the "
-                f"image at {self.times[0]:g}; leave --shutter out"
-            )
-
-    @property
-    def times(self) -> list[float]:
-        """When the averaged images are taken, in frames from the frame's own time."""
-        opens, closes = self.shutter
-        step = (closes - opens) / self.motion_samples
-        return [opens + (index + 0.5) * step for index in range(self.motion_samples)]
-
-    @property
-    def needs_neighbours(self) -> bool:
-        """Whether the frames before and after are needed."""
-        return "motion" in self.aovs or any(self.times)
 
 
 def render_picture(
@@ -141,35 +72,6 @@ def render_picture(
         fps=fps,
         provenance=provenance or {},
     )
-
-
-def hash_job(
-    frame: int, path: CameraPath, settings: RenderSettings, provenance: Mapping[str, str], writer: str
-) -> str:
-    """Return a hash of all that a picture's file depends on: equal where the bytes are equal.
-
-    Args:
-        frame: Frame number.
-        path: The camera.
-        settings: What is rendered.
-        provenance: Where the Gaussians come from, to the checkpoint's and the motion's own hashes.
-        writer: The settings of the file's writer, its `key`.
-    """
-    views = [path.at(frame + step) for step in (-1, 0, 1)]
-    facts = {
-        "frame": frame,
-        "cameras": [[v.name, v.width, v.height, v.K.tolist(), v.T_camera_world.tolist()] for v in views],
-        "settings": repr(settings),
-        "provenance": dict(sorted(provenance.items())),
-        "writer": writer,
-        "version": _version(),
-    }
-    return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()[:32]
-
-
-@cache
-def _version() -> str:
-    return importlib.metadata.version("dsar-avatar")
 
 
 def _with_overscan(camera: Camera, overscan: int) -> Camera:

@@ -15,9 +15,11 @@ from dsar.geometry.camera_paths import CameraPath
 from dsar.types import GaussianSequence
 from dsar_render.camera_names import check_camera_names
 from dsar_render.farm import run_tasks
-from dsar_render.images import crop_overscan, display_image, over
+from dsar_render.images import composite_over, crop_overscan, display_image
+from dsar_render.job_hash import hash_job
 from dsar_render.labels import Labels, label_sequence
-from dsar_render.picture import RenderSettings, hash_job, render_picture
+from dsar_render.picture import render_picture
+from dsar_render.settings import RenderSettings
 from dsar_render.triplets import FrameTriplet, iterate_triplets
 from dsar_render.writers import PictureWriter
 
@@ -135,4 +137,4 @@ class _FrameWork:
             writer.write(pictures, shot.job_hashes(triplet.frame, provenance, writer))
         if not self.previews:
             return []
-        return [display_image(over(crop_overscan(picture), 1.0)) for picture in pictures]
+        return [display_image(composite_over(crop_overscan(picture), 1.0)) for picture in pictures]

@@ -8,10 +8,10 @@ import math
 import pytest
 import torch
 
-from dsar.avatar import rollout
 from dsar.avatar.avatar import Avatar
+from dsar.avatar.charts import Atlas, body_chart
+from dsar.avatar.player import Player
 from dsar.avatar.rollout import roll_out
-from dsar.body.atlas import Atlas, body_chart
 from dsar.body.files import load_body
 from dsar.body.skinning import forward_kinematics, skin_points
 from dsar.config import ModelConfig
@@ -103,7 +103,7 @@ def test_a_skinned_body_is_where_its_motion_has_it_at_that_time(skinned, fps):
         assert (gaussians.means - expected).norm(dim=1).max() < 2e-5
     # What a line between posed frames would make of it.
     (_, first), (_, second) = itertools.islice(roll_out(skinned, motion), 2)
-    chord = FrameTriplet(1001, first, after=second).at(0.5).means
+    chord = FrameTriplet(1001, first, following=second).interpolate(0.5).means
     assert (chord - skin(skinned, spin(60.0))[1]).norm(dim=1).max() > 0.01
 
 
@@ -151,14 +151,13 @@ def test_any_frames_alone_are_those_of_the_whole(avatar, fps):
 )
 def test_the_network_goes_no_farther_than_the_last_frame_needs(avatar, monkeypatch, fps, frame, steps):
     made = []
-    outputs = rollout.network_outputs
+    forward_frame = Player.forward_frame
 
-    def counted(*arguments, **options):
-        for each in outputs(*arguments, **options):
-            made.append(each)
-            yield each
+    def counted(player):
+        made.append(player.next_frame)
+        return forward_frame(player)
 
-    monkeypatch.setattr(rollout, "network_outputs", counted)
+    monkeypatch.setattr(Player, "forward_frame", counted)
     motion = spin()
     assert len(list(roll_out(avatar, motion, delivered=resample(motion, fps), frames=[frame]))) == 1
     assert len(made) == steps

@@ -35,7 +35,7 @@ def avatar(capture):
 def test_the_chart_spans_the_true_skirt_at_rest(capture, avatar):
     columns = AtlasConfig().resolution
     chart = avatar.template.means.detach()[-columns * AtlasConfig().garment_rows :]
-    pelvis = avatar.driving_signal(capture.motions["sway"])[0, 0, 0]
+    pelvis = avatar.driving_signal(capture.motions["sway"]).windows[0, 0, 0]
     world = (chart @ pelvis[:3, :3].T + pelvis[:3, 3]).numpy()
     truth = capture.garment("sway")[0]
     assert abs(world[:, 1].min() - truth[:, 1].min()) < 0.04
@@ -57,16 +57,16 @@ def test_the_garments_figures_stand_between_the_template_s_and_the_truth_s(captu
 
 
 def test_links_close_the_tube_and_join_neither_charts_nor_islands(avatar):
-    columns, rows = avatar.grid_size[1], AtlasConfig().garment_rows // avatar.model.upsample
-    row, column = avatar.control_cells // columns, avatar.control_cells % columns
-    garment = row >= avatar.grid_size[0] - rows
-    a, b = avatar.surface_edges.T
+    columns, rows = avatar.control.size[1], AtlasConfig().garment_rows // avatar.model.upsample
+    row, column = avatar.control.cells // columns, avatar.control.cells % columns
+    garment = row >= avatar.control.size[0] - rows
+    a, b = avatar.control.edges.T
     assert torch.equal(garment[a], garment[b])
     seam = garment[a] & ((column[a] - column[b]).abs() == columns - 1)
     assert seam.sum() == rows
     # Around and down: every cell of the tube has its right neighbour and all but the last row the lower one.
     assert garment[a].sum() == rows * columns + (rows - 1) * columns
-    step = (avatar.control_points[a] - avatar.control_points[b]).norm(dim=1)
+    step = (avatar.control.points[a] - avatar.control.points[b]).norm(dim=1)
     assert step.max() <= 2 * step.median() * 1.3
 
 
@@ -149,7 +149,9 @@ def test_one_fitted_frame_covers_the_mask(capture, sequence, frame):
         state.optimizers["adam"].step()
     solid_recall, soft_recall = [], []
     with torch.no_grad():
-        gaussians = avatar.gaussians(trainer.signals[sequence][[frame]], state.rest.output(avatar, 0))[0]
+        gaussians = avatar.gaussians(
+            trainer.signals[sequence].windows[[frame]], state.rest.output(avatar, 0)
+        )[0]
         for index, camera in enumerate(capture.cameras):
             truth = torch.tensor(capture.image(sequence, frame, index)[..., 3]) / 255
             alpha = rasterize(gaussians, camera).alpha

@@ -68,7 +68,8 @@ def test_the_template_finds_the_cloth_and_every_still_frame_has_folds_of_its_own
 
     def posed(index, output) -> tuple[torch.Tensor, torch.Tensor]:
         sequence, frame = rest.frames[index]
-        motion_window, cloth = registration.signals[sequence][[frame]], capture.garment(sequence)[frame]
+        motion_window = registration.signals[sequence].windows[[frame]]
+        cloth = capture.garment(sequence)[frame]
         return avatar.gaussians(motion_window, output)[0].means[garment], torch.from_numpy(cloth)
 
     distances, own, shared = [], [], []
@@ -116,7 +117,7 @@ def frames_with_map(maps: RegisteredMaps) -> set[int]:
 
 
 def distance_to_cloth(capture, avatar, registration, maps) -> float:
-    motion_window = avatar.driving_signal(capture.motions[SEQUENCE])[[LAST]]
+    motion_window = avatar.driving_signal(capture.motions[SEQUENCE]).windows[[LAST]]
     points = registration._posed(motion_window, maps)
     cloth = torch.from_numpy(np.asarray(capture.garment(SEQUENCE)[LAST])).float()
     return float(torch.cdist(points, cloth).amin(1).mean())
@@ -131,7 +132,7 @@ def test_registered_maps_follow_the_cloth_into_a_spin(registered):
     before = distance_to_cloth(capture, avatar, registration, torch.zeros_like(found))
     assert distance_to_cloth(capture, avatar, registration, found) < 0.6 * before
     # The body is left alone.
-    body = torch.ones(len(avatar.control_cells), dtype=torch.bool)
+    body = torch.ones(len(avatar.control.cells), dtype=torch.bool)
     body[avatar.garment_control_points()] = False
     assert (maps[:, body] == 0).all()
 

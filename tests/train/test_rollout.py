@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from dsar.avatar.avatar import Avatar
+from dsar.avatar.charts import Atlas, body_chart
 from dsar.avatar.rollout import network_outputs, roll_out
-from dsar.body.atlas import Atlas, body_chart
 from dsar.body.files import load_body
 from dsar.config import ModelConfig
 from dsar.data.motions.files import rotate_motion
@@ -73,7 +73,7 @@ def test_unfamiliar_poses_become_familiar_ones_once_trained():
     flailing = dataclasses.replace(dance(60), rotations=3 * dance(60).rotations)
 
     def standardize(motion: Motion) -> torch.Tensor:
-        return avatar.standardize(avatar.input_maps(avatar.driving_signal(motion)[:2], 30.0))[0]
+        return avatar.standardize(avatar.input_maps(avatar.driving_signal(motion).windows[:2], 30.0))[0]
 
     raw, wild = standardize(dance(60)), standardize(flailing)
     avatar.eval()
@@ -81,19 +81,17 @@ def test_unfamiliar_poses_become_familiar_ones_once_trained():
     # Motion of many joints needs more than ten components, but not many more.
     assert (near - raw)[:, :3].square().mean() < 0.02 * raw[:, :3].square().mean()
     assert torch.equal(near[:, 3:], raw[:, 3:])
-    parts = (
-        avatar.input_maps(avatar.driving_signal(flailing)[:2], 30.0)
-        .maps[:, :3]
-        .flatten(2)[:, :, avatar.control_cells]
-    )
-    poses = avatar.principal_poses
-    far = ((parts.flatten(1) - poses.mean) @ poses.basis.mT).abs() / poses.deviation
-    assert far.max() > 2
-    points = (
-        tame[:, :3].flatten(2)[:, :, avatar.control_cells] * avatar.map_scale[:3, 0] + avatar.map_mean[:3, 0]
-    )
-    found = ((points.flatten(1) - poses.mean) @ poses.basis.mT).abs() / poses.deviation
-    assert found.max() < 2.01
+    statistics, poses = avatar.statistics, avatar.principal_poses
+
+    def deviations(maps: torch.Tensor) -> torch.Tensor:
+        """Return how far poses are from the mean of training along its components, in standard deviations."""
+        values = maps[:, :3].flatten(2)[:, :, avatar.control.cells]
+        points = values * statistics.map_scale[:3, 0] + statistics.map_mean[:3, 0]
+        coefficients = (points.flatten(1) - poses.mean) @ poses.basis.mT
+        return coefficients.abs() / poses.deviation
+
+    assert deviations(wild).max() > 2
+    assert deviations(tame).max() < 2.01
     assert not torch.allclose(tame[:, :3], wild[:, :3], atol=0.1)
 
 
@@ -161,7 +159,7 @@ def test_maps_that_are_switched_off_leave_the_others_and_the_speed_as_they_are(s
     seen = []
     for model in (config, dataclasses.replace(config, **{setting: off})):
         avatar = Avatar(body, atlas, model, 30.0)
-        motion_window = avatar.driving_signal(dance(20))[5:15]
+        motion_window = avatar.driving_signal(dance(20)).windows[5:15]
         seen.append(avatar.input_maps(motion_window, 30.0))
         assert seen[-1].maps.shape[1] == model.map_channels
     full, less = seen

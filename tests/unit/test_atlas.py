@@ -5,10 +5,11 @@ import dataclasses
 import pytest
 import torch
 
-from dsar.avatar.avatar import assign_control_cells
-from dsar.avatar.fused_posing import bilinear_sampling, sample_bilinear
-from dsar.body.atlas import Atlas, body_chart, rasterize_uv, smooth_weights
+from dsar.avatar.bilinear import bilinear_sampling, sample_bilinear
+from dsar.avatar.charts import Atlas, Chart, body_chart
+from dsar.avatar.control_grid import assign_control_cells
 from dsar.body.files import load_body
+from dsar.body.uv_map import rasterize_uv, smooth_weights
 from dsar.errors import BodyError
 
 
@@ -62,24 +63,25 @@ def test_every_occupied_cell_holds_a_texel_of_its_own(body):
     assert set((atlas.texels // 64 // 4 * 16 + atlas.texels % 64 // 4).tolist()) == set(cells.tolist())
 
 
-def test_taps_sample_maps_as_bilinear_interpolation_does():
+def test_texels_are_sampled_as_bilinear_interpolation_does():
     maps = torch.randn(2, 3, 6, 4, generator=torch.Generator().manual_seed(0))
     rows, columns = (
         grid.flatten() for grid in torch.meshgrid(torch.arange(24), torch.arange(16), indexing="ij")
     )
     expected = torch.nn.functional.interpolate(maps, size=(24, 16), mode="bilinear")
-    sampled = sample_bilinear(maps, bilinear_sampling(rows, columns, 4, (6, 4), square=24))
+    sampled = sample_bilinear(
+        maps, bilinear_sampling(rows, columns, 4, 4, [Chart("body", "island", range(24))])
+    )
     assert torch.allclose(sampled.mT.reshape(2, 3, 24, 16), expected, atol=1e-6)
 
 
-def test_a_garments_taps_go_round_its_tube_and_stay_off_the_body():
+def test_a_garments_texels_are_sampled_round_its_tube_and_off_the_body():
     maps = torch.randn(2, 3, 6, 4, generator=torch.Generator().manual_seed(0))
     rows, columns = (
         grid.flatten() for grid in torch.meshgrid(torch.arange(24), torch.arange(16), indexing="ij")
     )
-    sampled = sample_bilinear(maps, bilinear_sampling(rows, columns, 4, (6, 4), square=16)).mT.reshape(
-        2, 3, 24, 16
-    )
+    charts = [Chart("body", "island", range(16)), Chart("garment", "tube", range(16, 24))]
+    sampled = sample_bilinear(maps, bilinear_sampling(rows, columns, 4, 4, charts)).mT.reshape(2, 3, 24, 16)
     body, tube = (
         torch.nn.functional.interpolate(part, scale_factor=4, mode="bilinear")
         for part in (maps[:, :, :4], maps[:, :, 4:].repeat(1, 1, 1, 3))

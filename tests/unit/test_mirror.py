@@ -3,8 +3,8 @@
 import torch
 
 from dsar.avatar.avatar import Avatar
+from dsar.avatar.charts import Atlas, body_chart
 from dsar.avatar.mirror import Mirror, mirror_motion
-from dsar.body.atlas import Atlas, body_chart
 from dsar.body.files import load_body
 from dsar.body.model import JOINT_NAMES
 from dsar.body.skinning import forward_kinematics
@@ -27,7 +27,7 @@ def bare_avatar() -> Avatar:
 
 
 def mirror_of(avatar: Avatar) -> Mirror:
-    return Mirror(avatar.control_points, avatar.control_axes, avatar.control_cells)
+    return Mirror(avatar.control)
 
 
 def test_a_mirrored_motion_is_that_of_the_mirrored_joint_angles():
@@ -48,14 +48,14 @@ def test_a_mirrored_motion_is_that_of_the_mirrored_joint_angles():
 
 def test_mirrored_offsets_displace_the_mirrored_points():
     avatar = bare_avatar()
-    h, w = avatar.grid_size
+    h, w = avatar.control.size
     offset = torch.zeros(1, 3, h * w)
-    points = avatar.control_points
+    points = avatar.control.points
     # A displacement that is smooth in space: up on the left, backwards on the right, outwards at the head.
     world = torch.stack([points[:, 0] * points[:, 1], points[:, 0] * 0.3, -points[:, 0] * 0.2], -1)
-    offset[0, :, avatar.control_cells] = (avatar.control_axes.mT @ world[..., None])[..., 0].T
+    offset[0, :, avatar.control.cells] = (avatar.control.axes.mT @ world[..., None])[..., 0].T
     mirrored = mirror_of(avatar).mirror_offset(offset.reshape(1, 3, h, w)).flatten(2)
-    moved = (avatar.control_axes @ mirrored[0, :, avatar.control_cells].T[..., None])[..., 0]
+    moved = (avatar.control.axes @ mirrored[0, :, avatar.control.cells].T[..., None])[..., 0]
     reflected = torch.stack([-points[:, 0] * points[:, 1], -points[:, 0] * 0.3, points[:, 0] * 0.2], -1)
     expected = reflected * FLIP
     near = torch.cdist(points * FLIP, points).amin(1) < 0.02
@@ -66,7 +66,7 @@ def test_mirrored_offsets_displace_the_mirrored_points():
 
 def test_only_the_rollouts_that_were_mirrored_are_turned_back():
     avatar = bare_avatar()
-    h, w = avatar.grid_size
+    h, w = avatar.control.size
     channels = avatar.model.appearance_channels
     output = NetworkOutput(torch.randn(2, 3, h, w), torch.randn(2, channels, h, w), ())
     turned = mirror_of(avatar).unmirror(output, torch.tensor([False, True]))

@@ -3,7 +3,9 @@
 import pytest
 import torch
 
-from dsar.avatar.fused_posing import bilinear_sampling, pose_fused, sample_bilinear
+from dsar.avatar.bilinear import bilinear_sampling, sample_bilinear
+from dsar.avatar.charts import Chart
+from dsar.avatar.fused_posing import pose_fused
 from dsar.avatar.posing import _nearest_quaternions_plain, nearest_quaternions, pose_gaussians
 from dsar.avatar.template import GaussianParameters
 from dsar.geometry.rotations import matrix_from_axis_angle, matrix_from_quaternion, nearest_rotation
@@ -64,16 +66,17 @@ def test_fused_posing_equals_sampling_activation_and_posing_in_turn(degree):
         template.log_scales[:5] = -12.0
         template.log_scales[5:10] = 1.0
     rows, columns = torch.randint(24, (n,), generator=generator), torch.randint(16, (n,), generator=generator)
-    bilinear = bilinear_sampling(rows, columns, 4, (6, 4), 16)
+    charts = [Chart("body", "island", range(16)), Chart("garment", "tube", range(16, 24))]
+    sampling = bilinear_sampling(rows, columns, 4, 4, charts)
     axes = matrix_from_axis_angle(random(n, 3))
     turns = matrix_from_axis_angle(random(2, n, 3))
     blended = torch.cat([turns * 1.1, random(2, n, 3, 1)], -1)
     offset, appearance = (random(2, c, 6, 4).mul(0.2).requires_grad_() for c in (3, channels))
     leaves = [offset, appearance, *template.parameters()]
 
-    offsets = (axes * sample_bilinear(offset, bilinear)[..., None, :]).sum(-1)
-    expected = pose_gaussians(template.activate(offsets, sample_bilinear(appearance, bilinear)), blended)
-    fused = pose_fused(template, offset, appearance, bilinear, axes, blended)
+    offsets = (axes * sample_bilinear(offset, sampling)[..., None, :]).sum(-1)
+    expected = pose_gaussians(template.activate(offsets, sample_bilinear(appearance, sampling)), blended)
+    fused = pose_fused(template, offset, appearance, sampling, axes, blended)
     fields = [[value for g in both for value in vars(g).values()] for both in (expected, fused)]
     for slow, fast in zip(*fields, strict=True):
         assert torch.allclose(slow, fast, atol=1e-6)

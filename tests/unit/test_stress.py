@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from dsar.avatar.avatar import Avatar
-from dsar.body.atlas import Atlas, body_chart
+from dsar.avatar.charts import Atlas, body_chart
 from dsar.body.files import load_body
 from dsar.config import ModelConfig
 from dsar.evaluation import stress as battery
@@ -40,8 +40,8 @@ def pretend(monkeypatch):
     def put(offset):
         def outputs(avatar, motion):
             for frame in range(len(motion)):
-                value = torch.tensor(offset(frame)).expand(1, 3, *avatar.grid_size)
-                yield None, NetworkOutput(value.clone(), torch.zeros(1, 11, *avatar.grid_size), ())
+                value = torch.tensor(offset(frame)).expand(1, 3, *avatar.control.size)
+                yield None, NetworkOutput(value.clone(), torch.zeros(1, 11, *avatar.control.size), ())
 
         monkeypatch.setattr(battery, "network_outputs", outputs)
 

@@ -3,9 +3,9 @@
 import numpy as np
 import torch
 
+from dsar.avatar.charts import body_chart
 from dsar.avatar.garment_chart import tube_tangents
 from dsar.avatar.template import SCALE_IN_TEXELS, SCALE_RANGE, THICKNESS, texel_footprints
-from dsar.body.atlas import body_chart
 from dsar.body.files import load_body
 from dsar.geometry.rotations import matrix_from_axis_angle, matrix_from_quaternion
 

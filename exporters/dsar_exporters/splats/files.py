@@ -43,7 +43,7 @@ class SplatSequence(ABC):
         return self.folder / f"{self.name}.{frame:04d}{self.suffix}"
 
     @contextmanager
-    def opened(self, sequence: GaussianSequence) -> Iterator[Sink]:
+    def open_sink(self, sequence: GaussianSequence) -> Iterator[Sink]:
         """Take frames; see `Output`.
 
         Raises:
@@ -65,7 +65,7 @@ class SplatSequence(ABC):
         yield write
         self._written.append(write_manifest(self.folder, sequence, self._written))
 
-    def written(self) -> Sequence[Path]:
+    def written_files(self) -> Sequence[Path]:
         """Return the files of the last pass."""
         return list(self._written)
 

@@ -34,7 +34,7 @@ class GltfSnapshot:
     """A `.glb`."""
 
     @contextmanager
-    def opened(self, sequence: GaussianSequence) -> Iterator[Sink]:
+    def open_sink(self, sequence: GaussianSequence) -> Iterator[Sink]:
         """Take frames, keep the first; see `Output`.
 
         Raises:
@@ -62,7 +62,7 @@ class GltfSnapshot:
         """Return how large the file will be; see `Output`."""
         return len(first) * 4 * (_FLOATS + 3 * first.harmonics.shape[1])
 
-    def written(self) -> Sequence[Path]:
+    def written_files(self) -> Sequence[Path]:
         """Return the files of the last pass."""
         return [self.path, manifest_path(self.path)]
 

@@ -46,7 +46,7 @@ class UsdAsset:
     _written: list[Path] = field(default_factory=list, repr=False, compare=False)
 
     @contextmanager
-    def opened(self, sequence: GaussianSequence) -> Iterator[Sink]:
+    def open_sink(self, sequence: GaussianSequence) -> Iterator[Sink]:
         """Take frames; see `Output`.
 
         Raises:
@@ -90,7 +90,7 @@ class UsdAsset:
         )
         return round(frames * (_LEVELS * len(first) * (4 * floats + 2 * halves) + _FRAME_BYTES))
 
-    def written(self) -> Sequence[Path]:
+    def written_files(self) -> Sequence[Path]:
         """Return the files of the last pass."""
         return list(self._written)
 
@@ -127,12 +127,13 @@ def _library_errors(path: Path) -> Iterator[None]:
     """Turn USD's own errors, such as a full disk, into one of ours."""
     from pxr import Tf
 
+    from dsar_exporters.usd.stages import explain_usd_error
+
     try:
         yield
     except Tf.ErrorException as error:
-        # Of a chain of errors the first is the cause; USD quotes its words.
-        reasons = [each.commentary.strip() for each in error.args if hasattr(each, "commentary")]
-        reason = (reasons or [str(error)])[0]
+        # USD quotes the system's words.
+        reason = explain_usd_error(error)
         raise find_quoted_os_error(reason) or ExportError(
             f"{path}: USD could not write it: {reason}"
         ) from error

@@ -29,24 +29,24 @@ def open_stage(path: Path) -> Usd.Stage:
         ) from error
 
 
-def reason(error: Tf.ErrorException) -> str:
+def explain_usd_error(error: Tf.ErrorException) -> str:
     """Return what USD says of an error on one line: of a chain of errors the first is the cause."""
-    reasons = [each.commentary for each in error.args if hasattr(each, "commentary")]
+    reasons = [fault.commentary for fault in error.args if hasattr(fault, "commentary")]
     return " ".join((reasons or [str(error)])[0].split())
 
 
 @contextmanager
-def diagnostics_held() -> Iterator[None]:
+def warnings_withheld() -> Iterator[None]:
     """Keep USD's warnings from the terminal, where what they say is told otherwise."""
-    held = UsdUtils.CoalescingDiagnosticDelegate()
+    delegate = UsdUtils.CoalescingDiagnosticDelegate()
     try:
         yield
     finally:
-        held.TakeUncoalescedDiagnostics()
+        delegate.TakeUncoalescedDiagnostics()
 
 
 def _unopened(error: Tf.ErrorException) -> str:
-    return f"one that USD cannot open: {reason(error)}"
+    return f"one that USD cannot open: {explain_usd_error(error)}"
 
 
 def _misnamed(path: Path) -> str | None:

@@ -25,7 +25,7 @@ from dsar_exporters.usd.particle_faults import (
     id_faults,
     length_faults,
 )
-from dsar_exporters.usd.stages import diagnostics_held, open_stage, reason
+from dsar_exporters.usd.stages import explain_usd_error, open_stage, warnings_withheld
 
 _logger = logging.getLogger(__name__)
 
@@ -62,7 +62,7 @@ def usd_faults(path: Path, frames: Sequence[int] | None = None) -> Iterator[str]
     Raises:
         ExportError: It cannot be opened.
     """
-    with diagnostics_held():
+    with warnings_withheld():
         stage = open_stage(path)
         yield from _validator_errors(stage, whole=frames is None)
         any_particles = False
@@ -93,7 +93,7 @@ def _prim_faults(prim: Usd.Prim, where: str, frames: Sequence[int] | None) -> It
         else:
             yield from _splat_faults(UsdVol.ParticleField3DGaussianSplat(prim), where, frames)
     except Tf.ErrorException as error:
-        yield f"{where}: expected values that USD can read, found: {reason(error)}"
+        yield f"{where}: expected values that USD can read, found: {explain_usd_error(error)}"
 
 
 def _validator_errors(stage: Usd.Stage, *, whole: bool) -> Iterator[str]:
@@ -112,7 +112,7 @@ def _validator_errors(stage: Usd.Stage, *, whole: bool) -> Iterator[str]:
         errors = UsdValidation.ValidationContext(validators).Validate(stage)
     except Tf.ErrorException as error:
         # Validators run beside each other, and which error comes first is chance; the stage names the file.
-        reasons = [str(fault) for fault in stage.GetCompositionErrors()] or [reason(error)]
+        reasons = [str(fault) for fault in stage.GetCompositionErrors()] or [explain_usd_error(error)]
         expected = "expected files that USD can open, found one that it depends on broken"
         yield from (f"{expected}: {' '.join(text.split())}" for text in reasons)
         return

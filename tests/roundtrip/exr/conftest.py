@@ -11,7 +11,8 @@ from dsar.geometry.cameras import look_at
 from dsar.types import Camera, Picture
 from dsar_render.aovs import AOVS
 from dsar_render.labels import Labels, label_parts
-from dsar_render.picture import RenderSettings, render_picture
+from dsar_render.picture import render_picture
+from dsar_render.settings import RenderSettings
 from dsar_render.triplets import FrameTriplet, iterate_triplets
 
 

@@ -13,7 +13,8 @@ from dsar.raster import rasterize
 from dsar.types import Camera, Contributors, GaussianSequence, Picture
 from dsar_render.aovs import AOVS
 from dsar_render.labels import Labels, label_parts
-from dsar_render.picture import RenderSettings, render_picture
+from dsar_render.picture import render_picture
+from dsar_render.settings import RenderSettings
 from dsar_render.triplets import FrameTriplet, iterate_triplets
 
 

@@ -16,7 +16,8 @@ from dsar.geometry.rotations import (
 from dsar.raster import rasterize
 from dsar.types import Gaussians
 from dsar_render.blending import blend_values
-from dsar_render.picture import RenderSettings, render_picture
+from dsar_render.picture import render_picture
+from dsar_render.settings import RenderSettings
 from dsar_render.triplets import FrameTriplet
 
 

@@ -12,7 +12,8 @@ from dsar.geometry.cameras import look_at, project
 from dsar.raster import rasterize
 from dsar_render.aovs import AOVS
 from dsar_render.deep import sample_deep
-from dsar_render.picture import RenderSettings, render_picture
+from dsar_render.picture import render_picture
+from dsar_render.settings import RenderSettings
 
 
 @pytest.mark.parametrize("most", [1, 2, 4, 32])

@@ -15,7 +15,9 @@ from dsar.geometry.rotations import (
 )
 from dsar.types import Camera, Gaussians
 from dsar_render.aovs import AOVS
-from dsar_render.picture import RenderSettings, hash_job, render_picture
+from dsar_render.job_hash import hash_job
+from dsar_render.picture import render_picture
+from dsar_render.settings import RenderSettings
 from dsar_render.triplets import FrameTriplet
 
 PROVENANCE = {"checkpoint": "abc", "motion": "walk", "motion_hash": "12"}
@@ -84,7 +86,7 @@ def test_a_job_depends_on_everything_that_its_file_depends_on(front, moving):
 
 def test_a_job_depends_on_the_version(front, monkeypatch):
     before = named(front)
-    monkeypatch.setattr("dsar_render.picture._version", lambda: "9.9")
+    monkeypatch.setattr("dsar_render.job_hash._version", lambda: "9.9")
     assert named(front) != before
 
 

@@ -14,7 +14,8 @@ from dsar.geometry.rotations import (
     matrix_from_axis_angle,
 )
 from dsar.types import Gaussians, Picture
-from dsar_render.picture import RenderSettings, render_picture
+from dsar_render.picture import render_picture
+from dsar_render.settings import RenderSettings
 from dsar_render.triplets import FrameTriplet
 
 

@@ -16,7 +16,8 @@ from dsar.geometry.camera_paths import CameraPath
 from dsar.raster import rasterize
 from dsar.types import Gaussians
 from dsar_render.aovs import AOVS
-from dsar_render.picture import RenderSettings, render_picture
+from dsar_render.picture import render_picture
+from dsar_render.settings import RenderSettings
 from dsar_render.triplets import FrameTriplet
 
 
