@@ -96,11 +96,11 @@ def open_native(root: Path, body: Path | None = None) -> MultiViewCapture:
 
 def _read_record(where: Path) -> dict[str, Any]:
     record = read_json(where, CaptureError)
-    version = (record.get("format"), record.get("version")) if isinstance(record, dict) else (None, None)
-    if version != (FORMAT, VERSION):
+    fields = record if isinstance(record, dict) else {}
+    kind, version = fields.get("format"), fields.get("version")
+    if (kind, version) != (FORMAT, VERSION):
         raise CaptureError(
-            f"{where}: expected format {FORMAT!r} version {VERSION}, "
-            f"found {version[0]!r} version {version[1]!r}"
+            f"{where}: expected format {FORMAT!r} version {VERSION}, found {kind!r} version {version!r}"
         )
     return record
 
