@@ -10,6 +10,11 @@ import pytest
 import torch
 from PIL import Image
 
+from tests import type_checks
+
+# Before anything of ours is imported.
+type_checks.install()
+
 # Small tensors gain nothing from a second thread and lose much to spinning ones.
 torch.set_num_threads(1)
 
