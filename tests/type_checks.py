@@ -1,4 +1,4 @@
-"""Shapes and types are checked at run time, in all modules but those that their room calls many times a frame.
+"""Shapes and types are checked at run time, but not in modules that their room calls many times a frame.
 
 There the checks took as long again as the tests themselves; what goes in and comes out is checked at the
 room's door: `dsar.network.model` and `session`, `dsar.avatar.avatar`.
