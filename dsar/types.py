@@ -252,7 +252,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Binding:
-    """What Gaussians hang on at rest, and how it moves: enough to bind them again in another application."""
+    """Rest positions, skin weights and joint transforms that bind Gaussians to the body in any program."""
 
     body: Body
     """The body at rest."""

@@ -16,13 +16,13 @@ from dsar.avatar.guards import LIMITS, Guard
 from dsar.avatar.input_maps import InputMaps, make_input_maps
 from dsar.avatar.input_statistics import InputStatistics
 from dsar.avatar.posing import pose_gaussians
+from dsar.avatar.principal_poses import PrincipalPoses
 from dsar.avatar.rest_frames import find_rest_frames
 from dsar.avatar.template import VISIBLE_LOGIT, GaussianParameters
 from dsar.body.model import PARENTS
 from dsar.body.skinning import blend_transforms
 from dsar.config import AtlasConfig, ModelConfig
 from dsar.network import STREAMS, NetworkOutput, NetworkState, Stream, build_network
-from dsar.network.variants.principal_poses import PrincipalPoses
 from dsar.types import Body, Capture, Gaussians, Motion
 
 GARMENT_FRAMES = 12

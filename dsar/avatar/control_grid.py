@@ -1,4 +1,4 @@
-"""The control points: the points of the surface that the network's pixels stand for."""
+"""Control points: one point of the surface for each pixel of the network's maps."""
 
 from collections.abc import Sequence
 

@@ -1,9 +1,9 @@
 """Driving signals: a motion as what each step of a rollout sees of it.
 
 A *motion window* is what one step sees: T_world_rest of every joint in a frame and in the two frames before
-it, newest first, and then running means over the past, one for each of some time constants, as far as the
-body turned and moved its limbs: where inertia would have left the cloth. A *driving signal* holds the motion
-window of every frame.
+it, newest first, and then running means of these transforms, relative to the pelvis's position, one for each
+time constant: where inertia would have left the cloth. A *driving signal* holds the motion window of every
+frame.
 
 Where a body jumps (a cut, a glitch of the capture), its past jumps with it: nothing on earth moves so fast,
 and cloth that were told of it would fly apart.

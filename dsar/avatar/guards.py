@@ -18,9 +18,9 @@ class Limits:
     """Where each guard begins."""
 
     jump_speed: float = 12.0
-    """Metres per second of the pelvis above which a body has not moved, but jumped."""
+    """Speed of the pelvis, m/s, above which a frame is a discontinuity: a cut or a teleport."""
     jump_angular_speed: float = 20 * math.pi
-    """Radians per second of the pelvis above which it has, too: no skater turns ten times a second."""
+    """Angular speed of the pelvis, rad/s, above which it is one, too: no skater turns ten times a second."""
     speed: float = 0.4
     """Metres per 1/30 s (12 m/s) at which velocities of control points are cut for the network."""
     lag: float = 1.0

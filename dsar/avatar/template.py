@@ -1,4 +1,4 @@
-"""The learnable template: raw parameters of the canonical Gaussians (paper section 3.1)."""
+"""The learnable template: raw parameters of the canonical Gaussians (paper section 3.3)."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -27,7 +27,7 @@ class GaussianParameters(nn.Module):
         hidden: Bool[Tensor, " n"],
         sh_degree: int,
     ) -> None:
-        """Start grey, one Gaussian as large and as flat as its texel (see `Chart.tangents`).
+        """Start grey, one Gaussian as large and as flat as its texel (see `ChartTexels.tangents`).
 
         Those that are `hidden` are too transparent to be drawn, and so get no gradient.
         """

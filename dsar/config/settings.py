@@ -56,11 +56,11 @@ class ModelConfig:
     acceleration: bool = True
     """Feed acceleration maps (extension; it nearly halves the error of driven cloth)."""
     mean_time_constants: tuple[float, ...] = (0.1, 0.2, 0.4)
-    """Time constants, seconds, of running means of the motion; for each, the way from the newest frame to
-    the mean is fed as a map (extension): a memory that nothing has to learn."""
+    """Time constants, seconds, of running means of the motion; for each, the displacement from the newest
+    position to the mean is an input map (extension): a memory that nothing has to learn."""
     pose_components: int = 0
-    """New poses are replaced by what so many principal components of the training poses say
-    of them, each within two standard deviations (Li et al. 2024); 0: they are taken as they are."""
+    """New poses are projected onto so many principal components of the training poses, and kept within two
+    standard deviations of each (Li et al. 2024); 0: they are taken as they are."""
     motion_embedding: bool = True
     """Add the embedding of the motion magnitude to the deepest features."""
     channels: tuple[int, ...] = (16, 32, 64)

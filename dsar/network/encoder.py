@@ -1,11 +1,12 @@
 """Input maps and previous offsets to the features of a window: the paper's wiring, and what all share.
 
-A wiring says where the previous offset enters, and so what a session can cache. In the paper's every frame
-is given the newest offset, and all n are encoded at each step; `variants.offset_wiring` encodes one.
+A wiring says where the previous deformation, the offset map dmu(t-1), enters, and so what a session can
+cache. In the paper's every frame of the window is given the newest offset, and all n are encoded at each
+step. The default, `perframe`, is in `variants.offset_wiring`: it encodes the newest frame only.
 
-An encoder works in three steps, so that a session can cache what does not change: `encode_frame` says what
-the newest frame leaves behind, `precompute` computes what follows from that alone, `assemble_window` what
-is left.
+An encoder works in three steps, so that a session can cache what does not change: `encode_frame` returns the
+tensors of the newest frame that are cached, `precompute` what follows from those alone, `assemble_window`
+the rest.
 """
 
 from collections.abc import Sequence
@@ -70,7 +71,7 @@ class WindowEncoder(nn.Module):
         offsets: Float[Tensor, "b o h w"],
         static: Float[Tensor, "1 d _ _"],
     ) -> Sequence[Float[Tensor, "b _ _ _"]]:
-        """Return what a frame leaves behind; `offsets` are those before it, newest last."""
+        """Return the tensors of a frame that are cached; `offsets` are those before it, newest last."""
         raise NotImplementedError
 
     def precompute(

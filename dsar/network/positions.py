@@ -12,7 +12,7 @@ from dsar.network.temporal import TemporalAttention
 
 @dataclass(frozen=True)
 class PositionTable:
-    """The positions of a window's frames and what follows from them, for one order of frames or several.
+    """What depends on the positions of a window's frames: key and value biases, weights of temporal filters.
 
     Training holds the frames in order. In a session's ring the order depends on which entry is the newest: it
     computes the table of all orders once, and selects one a step.

@@ -1,9 +1,9 @@
 """Inference without gradients: the steps of `DualStreamNetwork.forward`, but computing only what is new.
 
-Whatever follows from a single frame is computed when it is the newest, and cached: its features (where the
-wiring lets them be), its embedded motion, its key and value, and those of its hidden state. What is cached
-lies in rings that are overwritten in place. What follows from weights and positions alone is computed once,
-for every place that the newest frame can have in a ring.
+What depends on one frame alone is computed once, when the frame arrives, and cached: its features (where the
+wiring lets them be), its embedded motion, its key and value, and those of its hidden state. The caches are
+rings that are overwritten in place. What depends on weights and positions alone is computed at the start, for
+every place that the newest frame can have in a ring.
 """
 
 import itertools
@@ -16,6 +16,7 @@ from torch import Tensor
 
 from dsar.network.encoder import WindowFeatures
 from dsar.network.frozen import frozen_copy
+from dsar.network.memory import MemoryBank
 from dsar.network.model import DualStreamNetwork, NetworkOutput
 from dsar.network.positions import PositionTable
 from dsar.network.ring import RingBuffer, RingIndex
@@ -141,7 +142,10 @@ class InferenceSession:
         attend = self._attend_cached if self._features_cacheable else self._attend_recomputed
         window, aggregate, newest = attend(precomputed, motion, offsets, positions)
         features = window.add_offset_features(newest)
-        hidden = aggregate if network.bank is None else self._remember(aggregate, features)
+        hidden = aggregate
+        if network.bank is not None:
+            hidden = self._retrieve(network.bank, aggregate, features)
+            self._update_bank(network.bank, hidden, features)
         output = network.decode(window, hidden, positions)
         for older, newer in itertools.pairwise([*self._offsets.unbind(1), output.offset]):
             older.copy_(newer)
@@ -176,17 +180,18 @@ class InferenceSession:
         key_values = network.attention.project_keys_values(deep)
         return window, network.aggregate(queries, key_values, window, positions), newest[:, 0]
 
-    def _remember(self, aggregate: Tensor, features: Tensor) -> Tensor:
-        """Return the hidden state of the newest frame, and put it into the bank."""
-        bank, key_values = self.network.bank, self._bank.entries
-        assert bank is not None
+    def _retrieve(self, bank: MemoryBank, aggregate: Tensor, features: Tensor) -> Tensor:
+        """Return the hidden state h of the newest frame, from what the bank holds of the past."""
+        key_values = self._bank.entries
         if key_values is None or "state" not in self.streams:
             first = bank.first_entry(aggregate, features)
             memory = first[:, None].expand(-1, self._bank_index.length, -1, -1, -1)
             key_values = bank.attention.project_keys_values(memory)
         position_bias = self._bank_position_bias.index_select(0, self._bank_index.newest)[0]
-        hidden = bank(aggregate, key_values, position_bias)
+        return bank(aggregate, key_values, position_bias)
+
+    def _update_bank(self, bank: MemoryBank, hidden: Tensor, features: Tensor) -> None:
+        """Put the newest frame's entry into the bank, as the key and value that later frames will ask for."""
         self._bank_index.advance()
         entry = bank.entry(hidden, features)
         self._bank.push(bank.attention.project_keys_values(entry[:, None])[:, 0])
-        return hidden

@@ -82,8 +82,8 @@ class TemporalAttention(nn.Module):
         """Return the attention's row of each query, softmax(Q K^T / sqrt(d) + M) V (paper equation 11).
 
         `key_values` and `position_bias` are `project_keys_values` and `position_bias` of the frames.
-        `offset_features` were to be added to every frame before that. Entries of `future_mask` are hidden
-        from a query.
+        With `offset_features` it is as if they had been added to every frame before. Entries of
+        `future_mask` are hidden from a query.
         """
         key_value_bias = position_bias[:, None, None]
         if offset_features is not None:

@@ -99,7 +99,7 @@ def temporal_losses(
 
     Args:
         records: Those of the newest frame and up to two before it, the newest last.
-        magnitudes: The motion magnitudes V of the window's frames, metres per frame, the newest last.
+        magnitudes: The motion magnitudes V of the window's frames, metres per 1/30 s, the newest last.
         ages: Frames that each rollout has seen before the newest: rollouts without enough past are left out.
         occupied: 1 where a pixel of the network's maps holds texels.
         cells: The control points' pixels, flat.

@@ -6,5 +6,6 @@
 * `mean_readout`: the mean of all rows of the window's attention (`model.readout`, `model.causal`).
 * `feature_bank`: a memory bank of features that no attention has seen (`model.bank`).
 * `linear_bases`: a mixture of fixed maps in place of the decoder (`model.bases`).
-* `principal_poses`: poses limited to what training has seen (`model.pose_components`); the avatar applies it.
+
+A variant of the network's input is `dsar.avatar.principal_poses` (`model.pose_components`).
 """
