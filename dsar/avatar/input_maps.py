@@ -66,33 +66,30 @@ def make_input_maps(
     ground = root * root.new_tensor([1.0, 0.0, 1.0])
     rate = fps / REFERENCE_FPS
     position = (points[:, 0] - ground[:, None]) @ headings
-    velocity, fast = limit_norm((points[:, 0] - points[:, 1]) * rate, LIMITS.speed)
-    velocity_before, _ = limit_norm((points[:, 1] - points[:, 2]) * rate, LIMITS.speed)
+    velocities, fast = limit_norm((points[:, :2] - points[:, 1:3]) * rate, LIMITS.speed)
+    velocity, velocity_before = velocities.unbind(1)
+    lags, far = limit_norm(points[:, 3:] - points[:, :1], LIMITS.lag)
     channels = [position]
     if model.velocity:
         channels.append(_along(axes, velocity))
     if model.acceleration:
         channels.append(_along(axes, (velocity - velocity_before) * rate))
-    counts = {Guard.SPEED: fast}
-    for mean in points[:, 3:].unbind(1):
-        lag, far = limit_norm(mean - points[:, 0], LIMITS.lag)
-        channels.append(_along(axes, lag))
-        counts[Guard.LAG] = counts[Guard.LAG] + far if Guard.LAG in counts else far
+    channels += _along(axes[:, None], lags).unbind(1)
     values = torch.cat([*channels, velocity.norm(dim=-1, keepdim=True)], -1)
     grid = values.new_zeros(len(values), values.shape[-1], control.size[0] * control.size[1])
     grid[:, :, control.cells] = values.transpose(1, 2)
     grid = grid.reshape(len(values), -1, *control.size)
-    return InputMaps(grid[:, :-1], grid[:, -1:], counts)
+    return InputMaps(grid[:, :-1], grid[:, -1:], {Guard.SPEED: fast[:, 0], Guard.LAG: far.sum(1)})
 
 
 def limit_norm(
-    vectors: Float[Tensor, "b p 3"], limit: float
-) -> tuple[Float[Tensor, "b p 3"], Int[Tensor, " b"]]:
+    vectors: Float[Tensor, "b k p 3"], limit: float
+) -> tuple[Float[Tensor, "b k p 3"], Int[Tensor, "b k"]]:
     """Shorten vectors that are longer than the limit, keeping their direction; return how many were, too."""
     norm = vectors.norm(dim=-1, keepdim=True)
-    return vectors * (limit / norm.clamp_min(limit)), (norm > limit).sum((1, 2))
+    return vectors * (limit / norm.clamp_min(limit)), (norm > limit).sum((2, 3))
 
 
-def _along(axes: Float[Tensor, "b p 3 3"], vectors: Float[Tensor, "b p 3"]) -> Float[Tensor, "b p 3"]:
+def _along(axes: Float[Tensor, "*#b p 3 3"], vectors: Float[Tensor, "*#b p 3"]) -> Float[Tensor, "..."]:
     """Return the components of world vectors along axes given as columns."""
     return (vectors[..., :, None] * axes).sum(-2)

@@ -71,7 +71,9 @@ class Player:
         self.avatar, self.signal = avatar, signal
         precision = torch.bfloat16 if signal.windows.is_cuda else None
         self._session = InferenceSession(avatar.network, streams, precision)
-        self._next, self._distance = 0, SNAPSHOT_FRAMES
+        jumped = torch.zeros(len(signal), dtype=torch.int64)
+        jumped[list(signal.jumps)] = 1
+        self._jumped, self._next, self._distance = jumped, 0, SNAPSHOT_FRAMES
         self._snapshots: dict[int, SessionSnapshot] = {0: self._session.snapshot()}
 
     @property
@@ -122,7 +124,7 @@ class Player:
         counts = {
             **inputs.guard_counts,
             Guard.OFFSET: (output.offset.abs() > near).sum((1, 2, 3)),
-            Guard.JUMP: torch.tensor([int(number in self.signal.jumps)]),
+            Guard.JUMP: self._jumped[number : number + 1],
         }
         self._next += 1
         return NetworkFrame(number, motion_window, output, counts)
