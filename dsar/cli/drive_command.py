@@ -86,13 +86,19 @@ class DriveCommand(RunCommand):
         return path if named_like_one or (path.suffix and path.is_file()) else None
 
     def open(self) -> DrivenAvatar:
-        """Return the avatar and its motion."""
+        """Return the avatar and its motion; from here on torch works with one thread.
+
+        With more threads sums are added in another order, and bytes would depend on the number of cores.
+        """
+        import torch
+
         from dsar.data.motions.files import resample
         from dsar.data.motions.out_of_distribution import log_out_of_distribution
         from dsar.training.checkpoint import Run, load_checkpoint
         from dsar.training.scene import open_scene
 
         self.check_device()
+        torch.set_num_threads(1)
         fps = None if self.fps is None else parse_rate(self.fps)
         run, file = Run(self.chosen_run()), self.motion_file()
         avatar, config, provenance = load_checkpoint(run)

@@ -112,8 +112,6 @@ class Render(DriveCommand):
 
     def run(self) -> None:
         """Render every chosen camera and write every requested format."""
-        import torch
-
         from dsar_render import Shot
 
         if self.exr is None and self.png is None and self.mp4 is None:
@@ -123,8 +121,6 @@ class Render(DriveCommand):
             raise ConfigError(
                 f"--res {self.res[0]} {self.res[1]}: expected width and height in pixels, at least 1 each"
             )
-        # With more threads sums are added in another order, and bytes would depend on the number of cores.
-        torch.set_num_threads(1)
         wanted = self.requested_frames()
         settings = self.settings()
         writers = tuple(self.writers())

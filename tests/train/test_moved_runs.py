@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 from dsar.body.files import load_body
 from dsar.cli import main
@@ -70,6 +71,17 @@ def run_job(job: Path, where: Path) -> subprocess.CompletedProcess:
         text=True,
         check=False,
     )
+
+
+def test_bytes_do_not_depend_on_the_number_of_threads(trained, tmp_path):
+    threads = torch.get_num_threads()
+    try:
+        for count in (1, 2):
+            torch.set_num_threads(count)
+            command("export", trained, "--ply", tmp_path / str(count), "--frames", "1001-1003")
+    finally:
+        torch.set_num_threads(threads)
+    assert contents(tmp_path / "1") == contents(tmp_path / "2")
 
 
 def test_a_run_that_moved_and_whose_capture_is_deleted_delivers_the_same_bytes(
