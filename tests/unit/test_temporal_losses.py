@@ -69,6 +69,13 @@ def test_speeds_from_before_a_restart_do_not_count():
     assert old < 0.1 * young
 
 
+def test_all_speeds_since_the_restart_count():
+    still, moved = torch.zeros(1, 3, 2, 2), torch.full((1, 3, 2, 2), 0.01)
+    after_its_first_frame = loss([record(still, speed=0.05), record(moved)], [1], prediction=1.0)
+    assert after_its_first_frame == loss([record(still, speed=0.05), record(moved)], [5], prediction=1.0)
+    assert after_its_first_frame < 0.1 * loss([record(still), record(moved)], [1], prediction=1.0)
+
+
 def test_an_acceleration_is_weighed_by_the_speed_of_the_frame_in_the_middle():
     still = torch.zeros(1, 3, 2, 2)
     for place in range(3):
