@@ -1,7 +1,7 @@
 """The true garment's points, followed by an avatar: where each of them would be if the avatar were right.
 
-A capture's truth has points of its own, an avatar has texels. Which belong together is decided once, where the
-garment hangs at rest in frames of training; from then on a true point rides on its nearest texels.
+A capture's truth has points of its own, an avatar has texels. Which belong together is decided once, where
+the garment hangs at rest in frames of training; from then on a true point rides on its nearest texels.
 
 What is measured is how cloth moves. So true points are tied to the garment *as the avatar lets it hang at
 rest*: what a network adds in the rest frames of training is taken off wherever it goes. A template that is a
@@ -60,7 +60,7 @@ class TrackedGarment:
     def carry(
         self, transforms: Float[Tensor, "j 4 4"], offsets: Float[Tensor, "v 3"] | None = None
     ) -> Float[Tensor, "v 3"]:
-        """Return the points in the world, metres: skinned by T_world_rest of the joints, from their offsets."""
+        """Return the offset points as T_world_rest of the joints carries them, world metres."""
         points = self.points if offsets is None else self.points + offsets
         return skin_points(points, self.weights, transforms)
 
@@ -99,7 +99,9 @@ def check_same_points(counts: Mapping[str, int], name: str) -> None:
         CaptureError: they do not.
     """
     if len(set(counts.values())) > 1:
-        raise CaptureError(f"capture {name}: expected as many points of the garment everywhere, found {counts}")
+        raise CaptureError(
+            f"capture {name}: expected as many points of the garment everywhere, found {counts}"
+        )
 
 
 def _transforms(avatar: Avatar, motion: Motion) -> Float[Tensor, "f j 4 4"]:

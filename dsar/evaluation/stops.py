@@ -1,4 +1,4 @@
-"""What a garment does after its wearer has stopped: how long it moves on, and how far it swings past its rest.
+"""What a garment does after its wearer has stopped: how long it moves on, how far it swings past its rest.
 
 Both are of the garment's own movement, over what the skin carries, so that a sway of the body is none of it.
 """
@@ -13,7 +13,7 @@ from dsar.evaluation.settling import rms_speeds, settling_time
 from dsar.types import Body
 
 MOVING, STILL = 0.6, 0.25
-"""Mean speeds of the joints, m/s: a body that was faster than the one and is slower than the other stopped."""
+"""Mean speeds of the joints, m/s: who was faster than the one and is slower than the other has stopped."""
 HOLD = 1.0
 """Seconds that a body must stay still for its garment's way to rest to be seen."""
 SLOW = 0.2

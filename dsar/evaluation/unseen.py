@@ -98,7 +98,7 @@ def free_points(capture: MultiViewCapture) -> Int64[Tensor, " p"]:
 def roll_out_points(
     avatar: Avatar, capture: MultiViewCapture, name: str, tracked: TrackedGarment, streams: Collection[Stream]
 ) -> tuple[Float[Tensor, "f v 3"], Float[Tensor, "f v 3"], Float[Tensor, "f j 4 4"]]:
-    """Return the garment's points as predicted and of the template, world metres, and T_world_rest of joints."""
+    """Return the garment's predicted points and the template's, world metres, and T_world_rest of joints."""
     predicted, template, transforms = [], [], []
     for motion_window, output in network_outputs(avatar, capture.motions[name], streams=streams):
         pose = motion_window[0, 0]
