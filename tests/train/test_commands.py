@@ -231,7 +231,7 @@ def test_unseen_motions_are_told_kept_and_shown(trained, tmp_path, monkeypatch, 
     found = {
         "validation": {
             "leap": UnseenMotion(61.5, 123.0, 9.0, 90, [stop]),
-            "waltz": UnseenMotion(30, 60, None, 80, []),
+            "waltz": UnseenMotion(30.0, 60.0, None, 80, []),
         },
         "test": {"dance": UnseenMotion(77.7, 111.0, 8.0, 70, [])},
     }
