@@ -59,8 +59,8 @@ class ModelConfig:
     """Time constants, seconds, of running means of the motion; for each, the displacement from the newest
     position to the mean is an input map (extension): a memory that nothing has to learn."""
     prior: Literal["cloth", "none"] = "cloth"
-    """`cloth`: a coarse simulation of each loose garment, driven by the same motion, is the base of the offset
-    and an input map (extension); `none`: the paper's. Without a loose garment there is none."""
+    """`cloth`: a coarse simulation of each loose garment, driven by the same motion, is an input map and the
+    base of the offset (extension); `none`: the paper's. Without a loose garment there is none."""
     pose_components: int = 0
     """New poses are projected onto so many principal components of the training poses, and kept within two
     standard deviations of each (Li et al. 2024); 0: they are taken as they are."""

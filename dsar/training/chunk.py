@@ -161,7 +161,8 @@ class ChunkTrainer:
     def _cloth(self, cursors: list[RolloutCursor]) -> Float[Tensor, "b g 6"] | None:
         """Return the motion prior where each rollout stands."""
         frames = [self.signals[cursor.sequence].cloth_at([cursor.frame]) for cursor in cursors]
-        return None if any(frame is None for frame in frames) else torch.cat(frames)
+        known = [frame for frame in frames if frame is not None]
+        return torch.cat(known) if known else None
 
     def _detach_state(self) -> None:
         """Cut what the rollouts carry on from the graph of this chunk."""
