@@ -20,6 +20,7 @@ PRESETS: dict[str, TrainConfig] = {
             memory=10,
             acceleration=False,
             mean_time_constants=(),
+            prior="none",
             channels=(64, 128, 256, 512),
             heads=8,
             upsample=1,

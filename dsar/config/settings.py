@@ -58,6 +58,9 @@ class ModelConfig:
     mean_time_constants: tuple[float, ...] = (0.1, 0.2, 0.4)
     """Time constants, seconds, of running means of the motion; for each, the displacement from the newest
     position to the mean is an input map (extension): a memory that nothing has to learn."""
+    prior: Literal["cloth", "none"] = "cloth"
+    """`cloth`: a coarse simulation of each loose garment, driven by the same motion, is the base of the offset
+    and an input map (extension); `none`: the paper's. Without a loose garment there is none."""
     pose_components: int = 0
     """New poses are projected onto so many principal components of the training poses, and kept within two
     standard deviations of each (Li et al. 2024); 0: they are taken as they are."""
@@ -91,7 +94,8 @@ class ModelConfig:
     @property
     def map_channels(self) -> int:
         """Channels of a frame's input maps without the offsets that are fed back."""
-        return 3 + 3 * self.velocity + 3 * self.acceleration + 3 * len(self.mean_time_constants)
+        motion = 3 + 3 * self.velocity + 3 * self.acceleration + 3 * len(self.mean_time_constants)
+        return motion + 6 * (self.prior == "cloth")
 
     @property
     def appearance_channels(self) -> int:

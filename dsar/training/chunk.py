@@ -144,18 +144,24 @@ class ChunkTrainer:
         driving_window = motion_window = torch.stack(
             [self.signals[c.sequence].windows[c.frame] for c in cursors]
         )
-        mirrored = torch.tensor([cursor.mirrored for cursor in cursors])
+        mirrored, cloth = torch.tensor([cursor.mirrored for cursor in cursors]), self._cloth(cursors)
         if self.mirror is not None:
             driving_window = torch.where(
                 mirrored[:, None, None, None, None], mirror_motion(motion_window), motion_window
             )
+            cloth = None if cloth is None else self.mirror.mirror_cloth(cloth, mirrored)
         output, state.network, input_maps = self.avatar.forward_frame(
-            driving_window, state.network, streams=streams
+            driving_window, state.network, cloth, streams=streams
         )
         unmirrored = self.mirror.unmirror(output, mirrored) if self.mirror is not None else output
         cursors = [dataclasses.replace(cursor) for cursor in cursors]
         state.rollouts.advance()
         return _Step(cursors, motion_window, driving_window, input_maps, output, unmirrored)
+
+    def _cloth(self, cursors: list[RolloutCursor]) -> Float[Tensor, "b g 6"] | None:
+        """Return the motion prior where each rollout stands."""
+        frames = [self.signals[cursor.sequence].cloth_at([cursor.frame]) for cursor in cursors]
+        return None if any(frame is None for frame in frames) else torch.cat(frames)
 
     def _detach_state(self) -> None:
         """Cut what the rollouts carry on from the graph of this chunk."""

@@ -23,6 +23,7 @@ from dsar.training.checkpoint import Run, check_files, load_checkpoint, read_con
 from dsar.training.chunk import ChunkTrainer
 from dsar.training.optimizers import set_rates
 from dsar.training.pace import Clock, leave, stop_signals
+from dsar.training.prior_fitting import fit_prior
 from dsar.training.registration import Registration
 from dsar.training.report import REPORT_EVERY, Monitor, Reporter, UpdateMetrics
 from dsar.training.resuming import check_same_settings, resumed_settings, with_body
@@ -94,6 +95,7 @@ def _train(config: TrainConfig, folder: Path, resume: bool, report: Reporter | N
     gradients = workers.Gradients([*avatar.parameters(), *state.rest.parameters()])
     if resume:
         read_checkpoint(run, state)
+        signals.update({name: avatar.with_cloth(signal) for name, signal in signals.items()})
     schedule = config.schedule if state.registered.clips else without_pretraining(config.schedule)
     clock, used, stop = Clock(schedule.minutes), 0.0, False
     monitor = Monitor(run.metrics, schedule.steps, report, began=state.progress)
@@ -108,6 +110,10 @@ def _train(config: TrainConfig, folder: Path, resume: bool, report: Reporter | N
                 show = partial(monitor.show, state.step, state.progress, "registration")
                 stop, used = _register(registration, gradients, received, clock, used, show)
                 continue
+            if schedule_state.stage != "template" and avatar.prior is not None and not avatar.prior.placed:
+                fit_prior(avatar, state.registered, signals, still, config.seed)
+                signals.update({name: avatar.with_cloth(signal) for name, signal in signals.items()})
+                avatar.fit_input_statistics(list(signals.values()))
             set_rates(state.optimizers, schedule_state)
             rng = np.random.default_rng([config.seed, workers.rank(), state.step])
             gradients.clear()
