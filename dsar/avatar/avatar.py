@@ -210,9 +210,15 @@ class Avatar(nn.Module):
         self, motion_windows: Float[Tensor, "b t j 4 4"], output: NetworkOutput
     ) -> Float[Tensor, "b p 3"]:
         """Return the newest frame's control points, offset and posed, world metres."""
+        blended = blend_transforms(self.control.weights, motion_windows[:, :1])[:, 0]
+        return self.pose_control_points(blended, output)
+
+    def pose_control_points(
+        self, blended: Float[Tensor, "b p 3 4"], output: NetworkOutput
+    ) -> Float[Tensor, "b p 3"]:
+        """Return the control points, offset and posed by each one's blend of transforms, world metres."""
         offsets = self.gather_control_points(output.offset)
         points = self.control.points + (self.control.axes * offsets[..., None, :]).sum(-1)
-        blended = blend_transforms(self.control.weights, motion_windows[:, :1])[:, 0]
         return (blended[..., :3] * points[..., None, :]).sum(-1) + blended[..., 3]
 
 

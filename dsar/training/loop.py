@@ -21,6 +21,7 @@ from dsar.training import workers
 from dsar.training.budget import check_budget
 from dsar.training.checkpoint import Run, check_files, load_checkpoint, read_config, read_progress
 from dsar.training.chunk import ChunkTrainer
+from dsar.training.kept_views import KeptViews, kept_bytes
 from dsar.training.optimizers import set_rates
 from dsar.training.pace import Clock, leave, stop_signals
 from dsar.training.registration import Registration
@@ -69,7 +70,7 @@ def train(config: TrainConfig, run: Run, *, resume: bool = False, report: Report
         check_files(run)
         check_same_settings(config, resumed_settings(run, config, whole), run)
     done = read_progress(run).progress if resume else 0.0
-    check_budget(config, workers.local_count(config.workers), done, capture.kept_bytes)
+    check_budget(config, workers.local_count(config.workers), done, capture.kept_bytes + kept_bytes(capture))
     write_scene(run.scene, scene_of_capture(whole))
     write_text_atomically(run.config, config_to_json(config))
     workers.run_workers(config.workers, _train, (config, run.folder, resume), report)
@@ -89,8 +90,9 @@ def _train(config: TrainConfig, folder: Path, resume: bool, report: Reporter | N
     signals = {name: avatar.driving_signal(capture.motions[name]) for name in clips}
     still = rest_frames(capture, signals, clips, avatar.fps)
     state = TrainingState.begin(config, capture, avatar.train(), clips, still)
-    trainer = ChunkTrainer(config, capture, state, signals, lpips)
-    registration = Registration(config, capture, avatar, state.rest, state.registered, signals)
+    views = KeptViews(capture)
+    trainer = ChunkTrainer(config, views, state, signals, lpips)
+    registration = Registration(config, views, avatar, state.rest, state.registered, signals)
     gradients = workers.Gradients([*avatar.parameters(), *state.rest.parameters()])
     if resume:
         read_checkpoint(run, state)

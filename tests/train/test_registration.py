@@ -14,6 +14,7 @@ from dsar.data.captures.formats import open_capture
 from dsar.evaluation.garment_metrics import distance_to_mesh
 from dsar.training import loop
 from dsar.training.chunk import ChunkTrainer
+from dsar.training.kept_views import KeptViews
 from dsar.training.optimizers import set_rates
 from dsar.training.registered_maps import RegisteredMaps, divide_sequences
 from dsar.training.registration import Registration
@@ -37,7 +38,7 @@ def registered():
     signals = {name: avatar.driving_signal(capture.motions[name]) for name in every}
     still = loop.rest_frames(capture, signals, every, avatar.fps)
     state = TrainingState.begin(config, capture, avatar, every, still)
-    trainer = ChunkTrainer(config, capture, state, signals, None)
+    trainer = ChunkTrainer(config, KeptViews(capture), state, signals, None)
     gradients = Gradients([*avatar.parameters(), *state.rest.parameters()])
     for step in range(60):
         set_rates(state.optimizers, schedule_at(config.schedule, 0.12 * step / 60))
@@ -47,9 +48,9 @@ def registered():
     avatar.unhide_covered_texels()
     clips = {SEQUENCE: range(4, LAST + 1)}
     state.registered = RegisteredMaps.begin(config, capture, avatar, clips)
-    registration = Registration(config, capture, avatar, state.rest, state.registered, signals)
+    registration = Registration(config, KeptViews(capture), avatar, state.rest, state.registered, signals)
     other = TrainingState.begin(config, capture, avatar, clips, still)
-    copy = Registration(config, capture, avatar, other.rest, other.registered, signals)
+    copy = Registration(config, KeptViews(capture), avatar, other.rest, other.registered, signals)
     for _ in range(LAST - 5):
         registration.fit_next()
     saved = {name: value.clone() for name, value in state.state_dict().items() if "registration." in name}
@@ -170,7 +171,7 @@ def test_the_network_learns_to_follow_maps_that_lag_behind_the_motion(registered
     state = TrainingState.begin(config, capture, small, {SEQUENCE: range(4, LAST + 1)}, [])
     state.registered = registration.maps
     signals = {SEQUENCE: small.driving_signal(capture.motions[SEQUENCE])}
-    trainer = ChunkTrainer(config, capture, state, signals, None)
+    trainer = ChunkTrainer(config, KeptViews(capture), state, signals, None)
     gradients, losses = Gradients(list(small.parameters())), []
     for step in range(60):
         set_rates(state.optimizers, schedule_at(config.schedule, 0.13 + 0.15 * step / 60))
