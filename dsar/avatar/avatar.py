@@ -19,6 +19,7 @@ from dsar.avatar.posing import pose_gaussians
 from dsar.avatar.principal_poses import PrincipalPoses
 from dsar.avatar.rest_frames import find_rest_frames
 from dsar.avatar.template import VISIBLE_LOGIT, GaussianParameters
+from dsar.avatar.texel_skin import TexelSkin
 from dsar.body.model import PARENTS
 from dsar.body.skinning import blend_transforms
 from dsar.config import AtlasConfig, ModelConfig
@@ -58,6 +59,7 @@ class Avatar(nn.Module):
         self.register_buffer("texel_hidden", atlas.hidden)
         axes = atlas.frames if model.axes == "surface" else torch.eye(3).expand_as(atlas.frames)
         self.register_buffer("texel_axes", axes.contiguous(), persistent=False)
+        self.texel_skin = TexelSkin.of_weights(atlas.weights)
         self.control = ControlGrid(atlas, model.upsample, surface_axes=model.axes == "surface")
         self.statistics = InputStatistics(model.map_channels)
         self.principal_poses = PrincipalPoses(model.pose_components, len(self.control.cells), LIMITS.pose)
@@ -194,15 +196,17 @@ class Avatar(nn.Module):
         self, motion_windows: Float[Tensor, "b t j 4 4"], output: NetworkOutput | None
     ) -> list[Gaussians]:
         """Return the posed Gaussians of each batch entry; without an output, the template's."""
-        blended = blend_transforms(self.texel_weights, motion_windows[:, :1])[:, 0]
+        transforms = motion_windows[:, 0]
         if output is None:
             shape = (len(motion_windows), 3 + self.model.appearance_channels, *self.control.size)
-            offset, appearance = blended.new_zeros(shape).split([3, shape[1] - 3], 1)
+            offset, appearance = transforms.new_zeros(shape).split([3, shape[1] - 3], 1)
         else:
             offset, appearance = output.offset, output.appearance
         sampling = self.control.sampling
-        if blended.dtype == torch.float32 and blended.device.type == "cpu":
-            return pose_fused(self.template, offset, appearance, sampling, self.texel_axes, blended)
+        if transforms.dtype == torch.float32 and transforms.device.type == "cpu":
+            bones = self.texel_skin.blend(transforms)
+            return pose_fused(self.template, offset, appearance, sampling, self.texel_axes, *bones)
+        blended = blend_transforms(self.texel_weights, transforms)
         offsets = (self.texel_axes * sample_bilinear(offset, sampling)[..., None, :]).sum(-1)
         return pose_gaussians(self.template.activate(offsets, sample_bilinear(appearance, sampling)), blended)
 
