@@ -73,7 +73,8 @@ class Registration:
             maps: What is fitted; those of this worker's sequences change.
             signals: Driving signals of the sequences.
         """
-        self.views, self.avatar, self.signals, self.seed = views, avatar, signals, config.seed
+        self.views, self.capture = views, views.capture
+        self.avatar, self.signals, self.seed = avatar, signals, config.seed
         self.rest, self.maps = rest, maps
         self.loss = dataclasses.replace(config.loss, **STRUCTURE)
         self.garment = avatar.garment_control_points()
@@ -94,7 +95,7 @@ class Registration:
         guesses, fast = self._guesses(motion_window, name, frame)
         points = self._posed(motion_window, guesses[0])
         view = functools.cache(functools.partial(self._view, name, frame, points=points))
-        cameras = self.views.capture.cameras_with_image(name, frame)
+        cameras = self.capture.cameras_with_image(name, frame)
         if not cameras:
             if frame > self.maps.clips[name].start:
                 self.maps.offsets[name][frame] = self.maps.offsets[name][frame - 1]

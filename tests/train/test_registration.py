@@ -21,6 +21,7 @@ from dsar.training.registration import Registration
 from dsar.training.rest import PULL, RestOffsets
 from dsar.training.schedule import schedule_at, without_pretraining
 from dsar.training.state import TrainingState
+from dsar.training.time_limit import TimeLimit
 from dsar.training.workers import Gradients
 
 SEQUENCE = "spin_right"
@@ -207,7 +208,6 @@ class ThreeFrames(Registration):
 
     def __init__(self):
         self.maps = RegisteredMaps({SEQUENCE: range(3)}, 1, {SEQUENCE: frozenset()})
-        self.maps.budget_used = 0.125
         self.avatar = SimpleNamespace(unhide_covered_texels=lambda: None)
 
     def fit_next(self):
@@ -220,13 +220,29 @@ def test_workers_whose_clocks_differ_agree_on_the_time_that_registration_took(be
     registration = ThreeFrames()
 
     class Late(loop.Clock):
-        def used(self):
-            return 0.5 + registration.maps.count / 8 - behind
+        def seconds(self):
+            return 5.0 + registration.maps.count - behind
 
     class Shared(Gradients):
-        def average(self, stop, used):
-            return stop, 0.5 + registration.maps.count / 8
+        def average(self, stop, seconds):
+            return stop, 5.0 + registration.maps.count
 
-    took = loop._register(registration, Shared([]), [], Late(1.0), 0.5, lambda *_: None)
-    assert took == (False, 0.875)
-    assert registration.maps.budget_used == 0.125 + 0.375
+    limit = TimeLimit(TrainConfig().schedule, used=2.0)
+    assert not loop._register(registration, Shared([]), [], Late(), limit, 0.12, lambda *_: None)
+    assert limit.seconds == 2.0 + 8.0
+
+
+def test_frames_that_time_was_too_short_for_are_counted():
+    registration = ThreeFrames()
+    schedule = dataclasses.replace(TrainConfig().schedule, steps=1000, minutes=1.0)
+    limit = TimeLimit(schedule, network_seconds=1.0)
+    for update in range(1, 7):
+        limit.note("template", 0.1 * update)
+
+    class Slow(Gradients):
+        def average(self, stop, seconds):
+            return stop, 25.0 + registration.maps.count
+
+    assert not loop._register(registration, Slow([]), [], loop.Clock(), limit, 0.12, lambda *_: None)
+    assert registration.maps.complete
+    assert registration.maps.unregistered == 3
