@@ -150,13 +150,14 @@ class ScheduleConfig:
     steps: int = 1500
     """Updates in all."""
     minutes: float | None = None
-    """Wall-clock budget, counted from the end of the first update (which compiles kernels on a new machine):
-    the schedule is compressed to fit when the machine is too slow for `steps`."""
+    """Limit on the time of training, counted from the end of the first update (which compiles kernels on a
+    new machine). A machine that is fast enough does the same `steps` as without it; where it is too slow the
+    schedule is compressed to fit, and the run says that it was cut short."""
     template_fraction: float = 0.12
     """Fraction of the updates that fit the template alone, on near-rest frames."""
     pretraining_fraction: float = 0.2
     """Fraction of the updates that train the network on registered maps, without images; 0: no registration
-    (the paper's). Registration itself takes no updates, but its time is part of the budget."""
+    (the paper's). Registration itself takes no updates, but its time counts."""
     pose_only_fraction: float = 0.0
     """Fraction that trains the network without feedback and memory (the paper's stage 1)."""
     half_resolution_fraction: float = 0.85
