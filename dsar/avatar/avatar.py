@@ -223,17 +223,15 @@ class Avatar(nn.Module):
 
     def add_prior(self, output: NetworkOutput, cloth: Float[Tensor, "b g 6"] | None) -> NetworkOutput:
         """Return the network's output on top of the motion prior, which is the base of the offset."""
-        return output if cloth is None else self.with_base(output, self.offset_base(cloth))
+        if cloth is None:
+            return output
+        return dataclasses.replace(output, offset=output.offset + self.offset_base(cloth))
 
     def offset_base(self, cloth: Float[Tensor, "b g 6"]) -> Float[Tensor, "b 3 h w"]:
-        """Return the offset maps, metres, that the network's are added to, of an avatar with a motion prior."""
+        """Return the offset maps, metres, that the network's are added to; the avatar has a motion prior."""
         if self.prior is None:
             raise ValueError("the avatar has no motion prior")
         return self.control.scatter(self.scatter_garment_points(self.prior.base(cloth)))
-
-    def with_base(self, output: NetworkOutput, base: Float[Tensor, "b 3 h w"] | None) -> NetworkOutput:
-        """Return an output with offsets on top of others."""
-        return output if base is None else dataclasses.replace(output, offset=output.offset + base)
 
     def gaussians(
         self, motion_windows: Float[Tensor, "b t j 4 4"], output: NetworkOutput | None

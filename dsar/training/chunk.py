@@ -146,7 +146,7 @@ class ChunkTrainer:
         output, state.network = self.avatar.network(
             driving.maps, driving.magnitude, state.network, streams=streams
         )
-        output = self.avatar.with_base(output, driving.base)
+        output = dataclasses.replace(output, offset=output.offset + driving.base)
         mirrored = torch.tensor([cursor.mirrored for cursor in cursors])
         unmirrored = self.mirror.unmirror(output, mirrored) if self.mirror is not None else output
         cursors = [dataclasses.replace(cursor) for cursor in cursors]

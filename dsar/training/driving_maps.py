@@ -36,14 +36,13 @@ class DrivingFrames:
     """Motion magnitude V, metres per 1/30 s."""
     control_transforms: Float[Tensor, "b p 3 4"]
     """Blend of T_world_rest at the control points."""
-    base: Float[Tensor, "b 3 h w"] | None
-    """What the offset starts from where the avatar has a motion prior, metres."""
+    base: Float[Tensor, "b 3 h w"]
+    """What the offset starts from, metres: the motion prior's, or zeros."""
 
     def index_select(self, frames: Int64[Tensor, " k"]) -> "DrivingFrames":
         """Return some of the frames."""
-        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         return DrivingFrames(
-            **{name: None if x is None else x.index_select(0, frames) for name, x in values.items()}
+            *(getattr(self, f.name).index_select(0, frames) for f in dataclasses.fields(self))
         )
 
 
@@ -104,28 +103,29 @@ class DrivingMaps:
         mirrored: Bool[Tensor, " b"],
     ) -> DrivingFrames:
         """Return what drives frames that were filmed, or their mirror images."""
-        avatar, base = self._avatar, None
+        avatar = self._avatar
         if mirrored.any():
             windows = torch.where(mirrored[:, None, None, None, None], mirror_motion(windows), windows)
             cloth = None if cloth is None else self._mirror.mirror_cloth(cloth, mirrored)
         inputs = avatar.input_maps(windows, avatar.fps, cloth)
         transforms = blend_transforms(avatar.control.weights, windows[:, :1])[:, 0]
-        if cloth is not None:
-            base = avatar.offset_base(cloth)
-        return DrivingFrames(*avatar.standardize(inputs), inputs.magnitude, transforms, base)
+        maps, magnitude = avatar.standardize(inputs)
+        base = maps.new_zeros(len(maps), 3, *maps.shape[2:]) if cloth is None else avatar.offset_base(cloth)
+        return DrivingFrames(maps, magnitude, inputs.magnitude, transforms, base)
 
 
 def frame_bytes(avatar: Avatar) -> int:
     """Return the bytes of one frame of the table."""
     height, width = avatar.control.size
-    based = 0 if avatar.prior is None else 3
-    numbers = (avatar.model.map_channels + 2 + based) * height * width + 12 * len(avatar.control.cells)
+    numbers = (avatar.model.map_channels + 5) * height * width + 12 * len(avatar.control.cells)
     return _FLOAT_BYTES * numbers
 
 
 def _joined(parts: Sequence[DrivingFrames]) -> DrivingFrames:
     """Return the frames of all parts, the maps' channels last in memory, as convolutions like them."""
-    fields = {f.name: [getattr(part, f.name) for part in parts] for f in dataclasses.fields(DrivingFrames)}
-    joined = {name: None if values[0] is None else torch.cat(values) for name, values in fields.items()}
-    joined["maps"] = joined["maps"].permute(0, 2, 3, 1).contiguous().permute(0, 3, 1, 2)
-    return DrivingFrames(**joined)
+    fields = {
+        f.name: torch.cat([getattr(part, f.name) for part in parts])
+        for f in dataclasses.fields(DrivingFrames)
+    }
+    fields["maps"] = fields["maps"].permute(0, 2, 3, 1).contiguous().permute(0, 3, 1, 2)
+    return DrivingFrames(**fields)
