@@ -11,7 +11,7 @@ Features = Mapping[str, Float[ndarray, "f k"]]
 """By sequence."""
 COMPONENTS = 30
 """Principal components of the training sequences' cloth that are predicted."""
-LENGTHS, RIDGES = (1.5, 3.0, 6.0, 12.0), (1e-3, 1e-2, 1e-1, 1.0)
+LENGTHS, RIDGES = (1.5, 3.0, 6.0, 12.0), (1e-2, 1e-1, 1.0, 10.0)
 """Lengths of the Gaussian kernel, in standard deviations of a feature, and weights of the ridge."""
 
 
