@@ -3,7 +3,7 @@
     PYTHON blender_cloth.py JOB.npz RESULT.npz
 
 JOB holds, in metres and with Y up: `start` [n, 3] (the cloth as cut, its first p vertices sewn to the waist),
-`quads` [q, 4], `anchors` [f, p, 3], `body` [f, v, 3], `body_faces` [t, 3], `fps`, `wind` [f, 3] in m/s, and
+`quads` [q, 4], `anchors` [f, p, 3], `body` [f, v, 3], `body_faces` [t, 3], `fps`, `gravity` [f, 3], and
 `settings`, the JSON of `wool.Wool`. RESULT gets `cloth` [f, n, 3] and `seconds`. Blender has Z up.
 """
 
@@ -37,7 +37,6 @@ def simulate(data: dict[str, np.ndarray], settings: dict[str, float], folder: Pa
     frames, pinned = data["anchors"].shape[:2]
     scene.frame_start, scene.frame_end = 1, frames
     scene.render.fps = round(float(data["fps"]))
-    scene.gravity = (0.0, 0.0, -9.81)
     body = _add_mesh("body", data["body"][0], data["body_faces"])
     _play_back(body, data["body"], folder / "body.pc2")
     _collide(body, settings)
@@ -47,9 +46,12 @@ def simulate(data: dict[str, np.ndarray], settings: dict[str, float], folder: Pa
     skirt.vertex_groups.new(name="sewn").add(list(range(pinned)), 1.0, "REPLACE")
     _play_back(skirt, targets, folder / "skirt.pc2")
     _make_cloth(skirt, settings, frames)
-    if np.any(data["wind"]):
-        _blow(data["wind"])
-    return np.stack([_evaluate(scene, skirt, frame + 1) for frame in range(frames)])
+    pulls = _z_up(data["gravity"])
+    cloth = []
+    for frame in range(frames):
+        scene.gravity = pulls[frame].tolist()
+        cloth.append(_evaluate(scene, skirt, frame + 1))
+    return np.stack(cloth)
 
 
 def _add_mesh(name: str, vertices: np.ndarray, faces: np.ndarray) -> bpy.types.Object:
@@ -91,23 +93,6 @@ def _make_cloth(skirt: bpy.types.Object, settings: dict[str, float], frames: int
     contact.use_collision, contact.use_self_collision = True, False
     contact.collision_quality, contact.distance_min = int(settings["contacts"]), settings["thickness"]
     contact.friction = settings["friction"]
-
-
-def _blow(wind: np.ndarray) -> None:
-    """Add a wind along its mean direction, keyed frame by frame."""
-    direction = _z_up(wind.mean(0))
-    field = bpy.data.objects.new("wind", None)
-    bpy.context.collection.objects.link(field)
-    bpy.context.view_layer.objects.active = field
-    field.select_set(True)
-    bpy.ops.object.forcefield_toggle()
-    field.field.type = "WIND"
-    from mathutils import Vector
-
-    field.rotation_euler = Vector(direction.tolist()).to_track_quat("Z", "Y").to_euler()
-    for frame, speed in enumerate(np.linalg.norm(wind, axis=1)):
-        field.field.strength = float(speed)
-        field.field.keyframe_insert("strength", frame=frame + 1)
 
 
 def _evaluate(scene: bpy.types.Scene, skirt: bpy.types.Object, frame: int) -> np.ndarray:

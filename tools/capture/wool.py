@@ -15,14 +15,16 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from capture.cloth import GRAVITY
 from capture.garment import Cut, Skirt, build_collider_mesh, hang, pose_points, prepend_pre_roll
 from dsar.types import Body, Motion
 
 WOOL_CUT = Cut(
-    columns=64, rows=22, band_rows=2, length=0.74, flare=1.9, wave=0.02, lowest=-0.79, painted=(4, 5)
+    columns=64, rows=22, band_rows=2, length=0.74, flare=2.4, wave=0.02, lowest=-0.79, painted=(4, 5)
 )
 SOLVER = Path(__file__).with_name("blender_cloth.py")
 PRE_ROLL = 60
+_GUST = 35
 
 
 @dataclass(frozen=True)
@@ -66,7 +68,7 @@ def drape_wool(
         wool: Constants of the cloth.
         python: A Python that can import `bpy`.
         seed: Of the irregularity that the folds start from.
-        disturbance: Strength of a wind that blows early in the pre-roll only: a second true run.
+        disturbance: Peak in m/s^2 of a sideways pull early in the pre-roll only: a second true run.
 
     Raises:
         CalledProcessError: Blender failed; its message is on the error stream.
@@ -74,8 +76,9 @@ def drape_wool(
     rolled = prepend_pre_roll(motion, PRE_ROLL)
     anchors = pose_points(body, rolled, skirt.band, skirt.band_weights)
     posed, faces = build_collider_mesh(body, rolled, skirt.cut)
-    wind = np.zeros((len(rolled), 3))
-    wind[: PRE_ROLL // 2] = disturbance * np.sin(np.linspace(0, np.pi, PRE_ROLL // 2))[:, None] * [0.8, 0, 0.6]
+    gravity = np.tile([0.0, -GRAVITY, 0.0], (len(rolled), 1))
+    gust = disturbance * np.sin(np.linspace(0, np.pi, _GUST))
+    gravity[:_GUST] += gust[:, None] * np.array([0.8, 0.0, 0.6])
     with tempfile.TemporaryDirectory() as folder:
         job, result = Path(folder) / "job.npz", Path(folder) / "result.npz"
         np.savez(
@@ -86,7 +89,7 @@ def drape_wool(
             body=posed,
             body_faces=faces,
             fps=motion.fps,
-            wind=wind,
+            gravity=gravity,
             settings=json.dumps(asdict(wool)),
         )
         subprocess.run([str(python), str(SOLVER), str(job), str(result)], check=True, stdout=subprocess.DEVNULL)
