@@ -4,14 +4,13 @@
 
 JOB holds, in metres and with Y up: `start` [n, 3] (the cloth as cut, its first p vertices sewn to the waist),
 `quads` [q, 4], `anchors` [f, p, 3], `body` [f, v, 3], `body_faces` [t, 3], `fps`, `gravity` [f, 3], and
-`settings`, the JSON of `wool.Wool`. RESULT gets `cloth` [f, n, 3] and `seconds`. Blender has Z up.
+`settings`, the JSON of `wool.Wool`. RESULT gets `cloth` [f, n, 3]. Blender has Z up.
 """
 
 import json
 import struct
 import sys
 import tempfile
-import time
 from pathlib import Path
 
 import bpy
@@ -25,9 +24,8 @@ def main() -> None:
         data = dict(file)
     settings = json.loads(str(data["settings"]))
     with tempfile.TemporaryDirectory() as folder:
-        start = time.monotonic()
         cloth = simulate(data, settings, Path(folder))
-        np.savez(result, cloth=cloth.astype(np.float32), seconds=time.monotonic() - start)
+        np.savez(result, cloth=cloth.astype(np.float32))
 
 
 def simulate(data: dict[str, np.ndarray], settings: dict[str, float], folder: Path) -> np.ndarray:

@@ -14,9 +14,10 @@ from capture.cloth import Collider, Fabric, build_struts, simulate
 from dsar.body.skinning import forward_kinematics, skin_points
 from dsar.types import Body, Motion
 
+
 @dataclass(frozen=True)
 class Cut:
-    """Measures of a flared skirt and the grid that it is simulated on; heights are in the body's rest frame."""
+    """Measures of a flared skirt and of its grid; heights are in the body's rest frame."""
 
     columns: int = 96
     rows: int = 30
@@ -32,8 +33,12 @@ class Cut:
     """Slope of the irregular wave that the folds start from."""
     lowest: float = -0.62
     """Height below which the body does not collide."""
+    hands: bool = True
+    """Whether hands and forearms collide."""
     painted: tuple[int, int] = (2, 3)
     """Painted vertices per simulated one, down and around."""
+    stored: tuple[int, int] = (2, 2)
+    """Rows, counted up from the hem, and columns of which one is stored as the truth."""
 
 
 FLARED = Cut()
@@ -219,7 +224,7 @@ def build_collider_mesh(
     vertices, weights, faces = body.vertices.numpy(), body.weights.numpy(), body.faces.numpy()
     lower = (vertices[:, 1] < cut.waist_height + 0.12) & (vertices[:, 1] > cut.lowest)
     hands = weights[:, list(_HANDS)].sum(1) > 0.5
-    keep = lower | hands
+    keep = lower | hands if cut.hands else lower
     index = np.cumsum(keep) - 1
     used = faces[keep[faces].all(1)]
     return pose_points(body, motion, vertices[keep], weights[keep]), index[used]

@@ -1,6 +1,5 @@
 """The dressed person as one moving mesh, the eight cameras, and the images of a frame."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,17 +9,13 @@ from numpy import ndarray
 
 from capture.garment import Cut, Skirt, grid_faces, vertex_normals
 from capture.shading import Lighting, Stage
+from capture.subjects import Paint
 from capture.wardrobe import Layer
 from dsar.body.skinning import skin_points
 from dsar.geometry.cameras import look_at
 from dsar.types import Camera
 
 WIDTH, HEIGHT = 192, 256
-Paint = Callable[
-    [Float[ndarray, " n"], Float[ndarray, " n"], float, int],
-    Float[ndarray, "n 3"],
-]
-"""A print: radius and angle in the flat cut, the whole cut's angle and a seed to linear albedo."""
 # azimuth in degrees from the person's front, height and distance in metres, focal length and
 # principal-point shift as shares of the image height and size.
 _RIG = (

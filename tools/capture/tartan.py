@@ -37,7 +37,8 @@ def paint_tartan(
         color = _cross(color, tint, 0.75 * _band(weft, place, 0.055))
     phase = 2 * np.pi * angle / turn
     ring = np.stack([np.cos(phase), np.sin(phase), radius / 0.35], -1) * 0.35
-    color = color * np.clip(1 + 0.05 * noise(ring, 0.12, rng) + 0.05 * noise(ring, 0.03, rng), 0.7, 1.3)[:, None]
+    mottle = 1 + 0.05 * noise(ring, 0.12, rng) + 0.05 * noise(ring, 0.03, rng)
+    color = color * np.clip(mottle, 0.7, 1.3)[:, None]
     color = _cross(color, PIPING, np.clip((0.007 - np.abs(outer - 0.078 - radius)) / 0.003, 0, 1))
     return _cross(color, BORDER, np.clip((radius - outer + 0.070) / 0.003, 0, 1))
 

@@ -1,8 +1,8 @@
 """The wool skirt of the second subject: its cut, its constants and its simulation by Blender.
 
-Blender's solver treats the cloth as points joined by springs, integrates them implicitly and resolves contacts
-by impulses, so its cloth has other habits than that of `cloth.py`. It runs in a Python of its own (`bpy` wants
-an older numpy), through `blender_cloth.py`.
+Blender's solver treats the cloth as points joined by springs, integrates them implicitly and resolves
+contacts by impulses, so its cloth has other habits than that of `cloth.py`. It runs in a Python of its own
+(`bpy` wants an older numpy), through `blender_cloth.py`.
 """
 
 import json
@@ -20,8 +20,10 @@ from capture.garment import Cut, Skirt, build_collider_mesh, hang, pose_points, 
 from dsar.types import Body, Motion
 
 WOOL_CUT = Cut(
-    columns=64, rows=22, band_rows=2, length=0.74, flare=2.4, wave=0.02, lowest=-0.79, painted=(4, 5)
-)
+    columns=64, rows=22, band_rows=2, length=0.74, flare=2.4, wave=0.02, lowest=-0.79, hands=False,
+    painted=(4, 5), stored=(2, 1),
+)  # fmt: skip
+"""Hands do not collide: they scoop up cloth that hangs on them for the rest of a sequence."""
 SOLVER = Path(__file__).with_name("blender_cloth.py")
 PRE_ROLL = 60
 _GUST = 35
@@ -29,7 +31,7 @@ _GUST = 35
 
 @dataclass(frozen=True)
 class Wool:
-    """Constants of Blender's cloth, in its own units; 1,408 vertices of .45 g a cubic centimetre of air."""
+    """Constants of Blender's cloth, in its own units."""
 
     mass: float = 0.5
     """Of a vertex. Gravity does not depend on it, all stiffness and the air do."""
@@ -58,8 +60,8 @@ def drape_wool(
     python: Path,
     seed: int,
     disturbance: float = 0.0,
-) -> tuple[Float[ndarray, "f n 3"], float]:
-    """Return the skirt's vertices at every recorded frame of a motion, and the seconds that a frame took.
+) -> Float[ndarray, "f n 3"]:
+    """Return the skirt's vertices at every recorded frame of a motion.
 
     Args:
         body: The body at rest.
@@ -92,10 +94,9 @@ def drape_wool(
             gravity=gravity,
             settings=json.dumps(asdict(wool)),
         )
-        subprocess.run([str(python), str(SOLVER), str(job), str(result)], check=True, stdout=subprocess.DEVNULL)
-        with np.load(result) as file:
-            cloth, seconds = file["cloth"], float(file["seconds"])
-    return cloth[PRE_ROLL:], seconds / len(cloth)
+        command = [str(python), str(SOLVER), str(job), str(result)]
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+        return np.load(result)["cloth"][PRE_ROLL:]
 
 
 def grid_quads(cut: Cut) -> Int[ndarray, "q 4"]:
