@@ -42,7 +42,7 @@ class Subject:
 FLORAL = Subject("embedded", "embedded", FLARED, paint_skirt, 5, 77, None)
 WOOL = Subject(
     *("embedded-wool", "embedded_wool", WOOL_CUT, paint_tartan, 5, 60),
-    {"sway": 100, "spin_both": 138, "twists": 112, "jumps": 104, "walk": 88, "far": 112},
+    {"sway": 50, "spin_both": 120, "twists": 82, "jumps": 48, "walk": 80, "far": 98},
     needs_blender=True,
 )
 SUBJECTS = {subject.name: subject for subject in (FLORAL, WOOL)}
