@@ -37,7 +37,10 @@ def simulate(data: dict[str, np.ndarray], settings: dict[str, float], folder: Pa
     scene.render.fps = round(float(data["fps"]))
     body = _add_mesh("body", data["body"][0], data["body_faces"])
     _play_back(body, data["body"], folder / "body.pc2")
-    _collide(body, settings)
+    corners = np.array([[-9.0, 0.0, 9.0], [9.0, 0.0, 9.0], [9.0, 0.0, -9.0], [-9.0, 0.0, -9.0]])
+    floor = _add_mesh("floor", corners, np.array([[0, 1, 2, 3]]))
+    for thing in (body, floor):
+        _collide(thing, settings)
     targets = np.repeat(data["start"][None], frames, 0)
     targets[:, :pinned] = data["anchors"]
     skirt = _add_mesh("skirt", data["start"], data["quads"])
@@ -69,11 +72,11 @@ def _play_back(thing: bpy.types.Object, positions: np.ndarray, path: Path) -> No
     modifier.interpolation = "LINEAR"
 
 
-def _collide(body: bpy.types.Object, settings: dict[str, float]) -> None:
-    body.modifiers.new("collision", "COLLISION")
-    body.collision.thickness_outer = settings["thickness"]
-    body.collision.cloth_friction = settings["friction"]
-    body.collision.use_culling = True
+def _collide(thing: bpy.types.Object, settings: dict[str, float]) -> None:
+    thing.modifiers.new("collision", "COLLISION")
+    thing.collision.thickness_outer = settings["thickness"]
+    thing.collision.cloth_friction = settings["friction"]
+    thing.collision.use_culling = True
 
 
 def _make_cloth(skirt: bpy.types.Object, settings: dict[str, float], frames: int) -> None:
