@@ -31,10 +31,10 @@ from dsar.types import Body
 VALIDATION, TEST = "unseen_validation", "unseen_test"
 PIECES = {
     "walk_curve": ("cmu_01_03", 0, 84, VALIDATION),
-    "turn_off": ("cmu_01_03", 348, 92, VALIDATION),
+    "turn_off": ("cmu_01_03", 368, 76, VALIDATION),
     "leap": ("cmu_01_01", 346, 82, VALIDATION),
     "walk_turn": ("cmu_01_03", 532, 80, TEST),
-    "turn_and_go": ("cmu_01_03", 826, 100, TEST),
+    "turn_and_go": ("cmu_01_03", 872, 70, TEST),
 }
 """Name: clip, first frame, frames, split. All are a second or more away from what trains and from `near`."""
 Curves = dict[str, ndarray]
