@@ -41,8 +41,8 @@ class Subject:
 
 FLORAL = Subject("embedded", "embedded", FLARED, paint_skirt, 5, 77, None)
 WOOL = Subject(
-    *("embedded-wool", "embedded_wool", WOOL_CUT, paint_tartan, 5, 60),
-    {"sway": 50, "spin_both": 120, "twists": 82, "jumps": 48, "walk": 80, "far": 98},
+    *("embedded-wool", "embedded_wool", WOOL_CUT, paint_tartan, 5, 42),
+    {"sway": 46, "spin_both": 116, "twists": 80, "jumps": 46, "walk": 78, "far": 96},
     needs_blender=True,
 )
 SUBJECTS = {subject.name: subject for subject in (FLORAL, WOOL)}
