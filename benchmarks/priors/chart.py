@@ -8,7 +8,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 
-KINDS = {"regression": ("C0", "o"), "simulation": ("C1", "s"), "failure": ("C3", "X")}
+KINDS = {"regression": ("C0", "o"), "simulation": ("C1", "s"), "variant": ("C3", "X")}
 
 
 def draw_chart(results: list[dict], path: Path) -> None:

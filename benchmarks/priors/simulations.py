@@ -142,7 +142,7 @@ class SimulatedGarment:
         """Return displacements at the garment's own points."""
         return {name: self.sampling(found).numpy() for name, found in displacements.items()}
 
-    def fit(self, generations: int, seed: int = 1) -> ClothConstants:
+    def fit(self, generations: int, make: Make = USUAL_MAKE, seed: int = 1) -> ClothConstants:
         """Return the constants with which training moves most like the truth (`dsar.training.prior_fitting`).
 
         It compares all three coordinates of the truth where training from images has registered maps.
@@ -153,7 +153,7 @@ class SimulatedGarment:
         targets = {name: torch.from_numpy(self.subject.offsets[name][:, few]) for name in names}
 
         def loss(logarithms: np.ndarray) -> float:
-            found = self.displacements(constants_at(logarithms), names)
+            found = self.displacements(constants_at(logarithms), names, make)
             errors = [
                 (self.few(found[name]) - target).norm(dim=-1).clamp_max(FARTHEST).mean()
                 / target.norm(dim=-1).mean()
