@@ -10,6 +10,7 @@ are compared, too: a faster update is the same update.
 import argparse
 import json
 import os
+import shlex
 import statistics
 import subprocess
 import sys
@@ -99,6 +100,12 @@ class Worker:
         state.step += 1
         return metrics.loss
 
+    def register(self) -> float:
+        """Register the next frame; return its loss."""
+        metrics = self.registration.fit_next()
+        assert metrics is not None, "cameras saw every frame"
+        return metrics.loss
+
     def measure(self, updates: int) -> dict[str, Any]:
         """Return milliseconds of processor time by part, and losses."""
         found: dict[str, Any] = {"ms": {}, "losses": {}}
@@ -115,7 +122,7 @@ class Worker:
         for part, progress in PROGRESS.items():
             timed(part, lambda part=part, progress=progress: self.update(part, progress))
         self.registration.maps.count = FIRST_FRAME
-        timed("registration", lambda: self.registration.fit_next().loss)
+        timed("registration", self.register)
         return found
 
 
@@ -193,7 +200,7 @@ def main() -> None:
     rows = summarize(before, after)
     seconds = [whole_run(rows, key) for key in ("before_ms", "after_ms")]
     found = {"parts": rows, "run_seconds": seconds, "rounds": rounds, "updates": updates}
-    found |= {"machine": describe_machine(), "load": read_load()}
+    found |= {"command": shlex.join(["python", *sys.argv]), **describe_machine(), "load": read_load()}
     if arguments.json:
         write_json(found, arguments.json)
     for part, row in rows.items():
