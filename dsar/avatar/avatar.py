@@ -3,7 +3,7 @@
 from collections.abc import Collection, Sequence
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 
 from dsar.avatar.bilinear import sample_bilinear
@@ -22,9 +22,12 @@ from dsar.avatar.template import VISIBLE_LOGIT, GaussianParameters
 from dsar.body.model import PARENTS
 from dsar.body.skinning import blend_transforms
 from dsar.config import AtlasConfig, ModelConfig
+from dsar.geometry.harmonics import dc_from_color
 from dsar.network import STREAMS, NetworkOutput, NetworkState, Stream, build_network
 from dsar.types import Body, Capture, Gaussians, Motion
 
+BORDER = 0.05
+"""Metres from a garment within which bare skin may carry its paint."""
 GARMENT_FRAMES = 12
 """Rest frames whose masks shape the garment's chart."""
 
@@ -41,6 +44,8 @@ class Avatar(nn.Module):
     texel_frames: Tensor
     texel_tangents: Tensor
     texel_hidden: Tensor
+    texel_guarded: Tensor
+    texel_borrowed: Tensor
     texel_axes: Tensor
     body_joints: Tensor
 
@@ -56,6 +61,8 @@ class Avatar(nn.Module):
         self.register_buffer("texel_frames", atlas.frames)
         self.register_buffer("texel_tangents", atlas.tangents)
         self.register_buffer("texel_hidden", atlas.hidden)
+        self.register_buffer("texel_guarded", atlas.hidden.clone())
+        self.register_buffer("texel_borrowed", atlas.hidden.clone())
         axes = atlas.frames if model.axes == "surface" else torch.eye(3).expand_as(atlas.frames)
         self.register_buffer("texel_axes", axes.contiguous(), persistent=False)
         self.control = ControlGrid(atlas, model.upsample, surface_axes=model.axes == "surface")
@@ -151,17 +158,45 @@ class Avatar(nn.Module):
         """Show the body beneath garments as the nearest bare texel is; called once the template is fitted.
 
         Fitted along with the garment it would be painted like it, and when the cloth lifts, that paint
-        stays behind.
+        stays behind. From then on these texels are guarded: nothing but `guard_looks` changes their looks.
         """
         if not self.texel_hidden.any():
             return
-        body = self.texels_on(self.charts[:1])
+        body, points = self.texels_on(self.charts[:1]), self.texel_positions
         bare = body[~self.texel_hidden[body]]
-        points = self.texel_positions
-        source = bare[torch.cdist(points[self.texel_hidden], points[bare]).argmin(1)]
-        self.template.harmonics[self.texel_hidden] = self.template.harmonics[source]
-        self.template.opacity_logits[self.texel_hidden] = VISIBLE_LOGIT
+        apart = torch.cdist(points[bare], points[self.texel_hidden]).amin(1) > BORDER
+        self._borrow_looks(self.texel_hidden, bare[apart] if apart.any() else bare)
         self.texel_hidden.fill_(False)
+
+    @torch.no_grad()
+    def guard_looks(
+        self, guarded: Bool[Tensor, " n"], colors: Float[Tensor, "n 3"], seen: Bool[Tensor, " n"]
+    ) -> None:
+        """Give body texels that a garment covers at times their looks, which nothing changes any more.
+
+        Args:
+            guarded: These texels, besides those that are guarded already.
+            colors: Display-referred sRGB in [0, 1] of those that were `seen` in pixels without a garment. The
+                others take the looks of the nearest texel that was, or that no garment ever covers.
+            seen: Which guarded texels have a colour.
+        """
+        self.texel_guarded |= guarded
+        seen = seen & self.texel_guarded
+        harmonics = self.template.harmonics
+        harmonics[seen] = 0.0
+        harmonics[seen, 0] = dc_from_color(colors[seen])
+        body = self.texels_on(self.charts[:1])
+        self._borrow_looks(self.texel_guarded & ~seen, body[(seen | ~self.texel_guarded)[body]])
+        logits = self.template.opacity_logits
+        logits[self.texel_guarded] = logits[self.texel_guarded].clamp_min(VISIBLE_LOGIT)
+        self.texel_borrowed.copy_(self.texel_guarded & ~seen)
+
+    def _borrow_looks(self, which: Bool[Tensor, " n"], sources: Int64[Tensor, " m"]) -> None:
+        """Give some texels the colours of the nearest of others, and let them be seen."""
+        points = self.texel_positions
+        nearest = sources[torch.cdist(points[which], points[sources]).argmin(1)]
+        self.template.harmonics[which] = self.template.harmonics[nearest]
+        self.template.opacity_logits[which] = VISIBLE_LOGIT
 
     def gather_control_points(self, offset: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b p 3"]:
         """Return a map's offsets at the control points, along their own axes, metres."""
@@ -202,9 +237,11 @@ class Avatar(nn.Module):
             offset, appearance = output.offset, output.appearance
         sampling = self.control.sampling
         if blended.dtype == torch.float32 and blended.device.type == "cpu":
-            return pose_fused(self.template, offset, appearance, sampling, self.texel_axes, blended)
+            axes, guarded = self.texel_axes, self.texel_guarded
+            return pose_fused(self.template, offset, appearance, sampling, axes, blended, guarded)
         offsets = (self.texel_axes * sample_bilinear(offset, sampling)[..., None, :]).sum(-1)
-        return pose_gaussians(self.template.activate(offsets, sample_bilinear(appearance, sampling)), blended)
+        residuals = sample_bilinear(appearance, sampling)
+        return pose_gaussians(self.template.activate(offsets, residuals, self.texel_guarded), blended)
 
     def deformed_control_points(
         self, motion_windows: Float[Tensor, "b t j 4 4"], output: NetworkOutput

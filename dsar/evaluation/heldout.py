@@ -47,6 +47,12 @@ def evaluate(
     garments = {name: measure_garment(avatar, capture, name, 2 * stride) for name in capture.splits["test"]}
     if not all(garment_ground_truth(capture, name) for name in by_sequence):
         skipped["psnr_garment"] = "the capture does not say where the garment is"
+    if not any(view.psnr_uncovered is not None for views in by_sequence.values() for view in views):
+        skipped["psnr_uncovered"] = (
+            "the avatar has no garment chart"
+            if not avatar.garments
+            else "the capture does not say where the garment is, or it never leaves the body free"
+        )
     if not all(garments.values()):
         skipped["garment"] = "no simulated garment in the capture, or no garment chart in the avatar"
     times = time_rollout(avatar, capture, capture.splits["test"][0])

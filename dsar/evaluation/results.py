@@ -26,6 +26,8 @@ class ViewMetrics:
     ssim: float
     psnr_garment: float | None = None
     """dB, where the garment is visible in truth."""
+    psnr_uncovered: float | None = None
+    """dB, where the body is visible in truth and a garment at rest would hide it."""
     lpips: float | None = None
     lpips_vgg: float | None = None
     flip: float | None = None
@@ -55,6 +57,7 @@ class SplitMetrics:
     psnr_box: float | None
     psnr_box_template: float | None
     psnr_garment: float | None
+    psnr_uncovered: float | None
     ssim: float | None
     lpips: float | None
     lpips_vgg: float | None

@@ -21,7 +21,8 @@ from dsar.training import workers
 from dsar.training.budget import check_budget
 from dsar.training.checkpoint import Run, check_files, load_checkpoint, read_config, read_progress
 from dsar.training.chunk import ChunkTrainer
-from dsar.training.optimizers import set_rates
+from dsar.training.layers import Layers
+from dsar.training.optimizers import keep_still, set_rates
 from dsar.training.pace import Clock, leave, stop_signals
 from dsar.training.registration import Registration
 from dsar.training.report import REPORT_EVERY, Monitor, Reporter, UpdateMetrics
@@ -91,6 +92,12 @@ def _train(config: TrainConfig, folder: Path, resume: bool, report: Reporter | N
     state = TrainingState.begin(config, capture, avatar.train(), clips, still)
     trainer = ChunkTrainer(config, capture, state, signals, lpips)
     registration = Registration(config, capture, avatar, state.rest, state.registered, signals)
+    layers = Layers(capture, avatar, state.registered, signals, clips)
+
+    def settle_layers() -> None:
+        layers.settle()
+        keep_still(state.optimizers, avatar)
+
     gradients = workers.Gradients([*avatar.parameters(), *state.rest.parameters()])
     if resume:
         read_checkpoint(run, state)
@@ -107,7 +114,11 @@ def _train(config: TrainConfig, folder: Path, resume: bool, report: Reporter | N
             if schedule_state.stage != "template" and not state.registered.complete:
                 show = partial(monitor.show, state.step, state.progress, "registration")
                 stop, used = _register(registration, gradients, received, clock, used, show)
+                if state.registered.complete:
+                    settle_layers()
                 continue
+            if schedule_state.stage != "template" and avatar.texel_hidden.any():
+                settle_layers()
             set_rates(state.optimizers, schedule_state)
             rng = np.random.default_rng([config.seed, workers.rank(), state.step])
             gradients.clear()

@@ -76,7 +76,7 @@ def test_fused_posing_equals_sampling_activation_and_posing_in_turn(degree):
 
     offsets = (axes * sample_bilinear(offset, sampling)[..., None, :]).sum(-1)
     expected = pose_gaussians(template.activate(offsets, sample_bilinear(appearance, sampling)), blended)
-    fused = pose_fused(template, offset, appearance, sampling, axes, blended)
+    fused = pose_fused(template, offset, appearance, sampling, axes, blended, guarded)
     fields = [[value for g in both for value in vars(g).values()] for both in (expected, fused)]
     for slow, fast in zip(*fields, strict=True):
         assert torch.allclose(slow, fast, atol=1e-6)
