@@ -28,6 +28,8 @@ from dsar.types import Body, Capture, Gaussians, Motion
 
 BORDER = 0.05
 """Metres from a garment within which bare skin may carry its paint."""
+STRAYED = 0.02
+"""Metres from its texel from which on a Gaussian of bare skin is none any more."""
 GARMENT_FRAMES = 12
 """Rest frames whose masks shape the garment's chart."""
 
@@ -174,6 +176,8 @@ class Avatar(nn.Module):
     ) -> None:
         """Give body texels that a garment covers at times their looks, which nothing changes any more.
 
+        Those that strayed from the body, to fill in for the garment's border, come back.
+
         Args:
             guarded: These texels, besides those that are guarded already.
             colors: Display-referred sRGB in [0, 1] of those that were `seen` in pixels without a garment. The
@@ -187,6 +191,8 @@ class Avatar(nn.Module):
         harmonics[seen, 0] = dc_from_color(colors[seen])
         body = self.texels_on(self.charts[:1])
         self._borrow_looks(self.texel_guarded & ~seen, body[(seen | ~self.texel_guarded)[body]])
+        strayed = (self.template.means - self.texel_positions).norm(dim=1) > STRAYED
+        self.template.reset_shapes(self.texel_guarded & strayed, self.texel_positions, self.texel_tangents)
         logits = self.template.opacity_logits
         logits[self.texel_guarded] = logits[self.texel_guarded].clamp_min(VISIBLE_LOGIT)
         self.texel_borrowed.copy_(self.texel_guarded & ~seen)

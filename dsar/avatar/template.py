@@ -42,6 +42,15 @@ class GaussianParameters(nn.Module):
         harmonics[:, 0] = dc_from_color(torch.tensor([0.5, 0.5, 0.5]))
         self.harmonics = nn.Parameter(harmonics)
 
+    @torch.no_grad()
+    def reset_shapes(
+        self, which: Bool[Tensor, " n"], positions: Float[Tensor, "n 3"], tangents: Float[Tensor, "n 3 2"]
+    ) -> None:
+        """Make some Gaussians the footprints of their texels again."""
+        rotations, scales = texel_footprints(tangents[which])
+        self.means[which], self.quaternions[which] = positions[which], rotations
+        self.log_scales[which] = scales.log()
+
     def activate(
         self,
         offset: Float[Tensor, "b n 3"] | None = None,

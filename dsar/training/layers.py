@@ -20,7 +20,6 @@ from dsar.avatar.avatar import Avatar
 from dsar.avatar.driving import DrivingSignal
 from dsar.avatar.garment_chart import arm_joints, tube_faces
 from dsar.body.skinning import skin_points
-from dsar.geometry.cameras import project
 from dsar.raster.mesh import MeshView, rasterize_mesh
 from dsar.training import workers
 from dsar.training.registered_maps import RegisteredMaps
@@ -33,10 +32,11 @@ FRAMES = 64
 """Training frames that are looked at: half of them those with the hem highest, the others evenly spread."""
 WIDTH = 192
 """Pixels to which larger images are reduced."""
-MARGIN = 0.03
-"""Metres around a garment that are not taken for bare: what registered maps err by."""
-LABEL_MARGIN = 0.01
-"""The same around the garment by a capture's own labels."""
+MARGIN, LABEL_MARGIN = 0.02, 0.01
+"""Metres around a garment that are not taken for bare, by registered maps and by a capture's own labels."""
+SHADE = 0.04
+"""Metres in which the weight of a pixel falls to 1/e with its distance from the garment: skin just out of it
+is in its shade, and mostly seen so."""
 FEWEST = 3
 """Pixels that make a colour."""
 
@@ -46,7 +46,9 @@ class _Sightings:
     """What the views say of each texel, added up."""
 
     colors: Float[Tensor, "n 3"]
-    """Sum of sRGB over pixels without a garment."""
+    """Weighted sum of sRGB over pixels without a garment."""
+    weights: Float[Tensor, " n"]
+    """Sum of their weights."""
     pixels: Float[Tensor, " n"]
     """How many those are."""
     covered: Float[Tensor, " n"]
@@ -89,14 +91,15 @@ class Layers:
         if not len(self.garment):
             return
         count = avatar.num_gaussians
-        found = _Sightings(torch.zeros(count, 3), torch.zeros(count), torch.zeros(count))
+        found = _Sightings(torch.zeros(count, 3), *(torch.zeros(count) for _ in range(3)))
         for index, (sequence, frame) in enumerate(self.frames()):
             if index % workers.world_size() == workers.rank():
                 self._look(sequence, frame, found)
-        workers.all_reduce([found.colors, found.pixels, found.covered])
+        workers.all_reduce([found.colors, found.weights, found.pixels, found.covered])
         covered = (found.covered > 0) & self._coverable()
         seen = found.pixels >= FEWEST
-        avatar.guard_looks(covered, found.colors / found.pixels.clamp_min(1)[:, None], seen)
+        colors = found.colors / found.weights.clamp_min(1e-6)[:, None]
+        avatar.guard_looks(covered, colors, seen)
         guarded = int(avatar.texel_guarded.sum())
         LOGGER.info(
             "Beneath the garment: %d texels, %.0f %% of them never seen without it: they look as the nearest "
@@ -152,10 +155,11 @@ class Layers:
             target = load_target(self.capture, sequence, frame, index, reduction)
             body = rasterize_mesh(vertices, self.body.faces, target.camera)
             texels = self._texels(body)
-            over, near = self._garment_pixels(sequence, frame, index, tube, body, target)
+            over, closeness, margin = self._garment_pixels(sequence, frame, index, tube, body, target)
             whole = -_spread(-target.alpha, 1) > 1 - 1e-3
-            free = whole & ~near & (texels >= 0)
-            found.colors.index_add_(0, texels[free], target.color[free])
+            free = whole & (closeness < math.exp(-margin / SHADE)) & (texels >= 0)
+            found.colors.index_add_(0, texels[free], target.color[free] * closeness[free, None])
+            found.weights.index_add_(0, texels[free], closeness[free])
             found.pixels.index_add_(0, texels[free], torch.ones(int(free.sum())))
             hidden = texels[over & (texels >= 0)]
             found.covered.index_add_(0, hidden, torch.ones(len(hidden)))
@@ -176,25 +180,16 @@ class Layers:
         tube: Float[Tensor, "g 3"] | None,
         body: MeshView,
         target: Target,
-    ) -> tuple[Bool[Tensor, "h w"], Bool[Tensor, "h w"]]:
-        """Return where a garment is before the body, and where it is or may be at all."""
+    ) -> tuple[Bool[Tensor, "h w"], Float[Tensor, "h w"], float]:
+        """Return where a garment is before the body, `_closeness` to it, and the margin that it needs."""
         labels = self.capture.garment_mask(sequence, frame, camera)
         if labels is not None:
             covered = _reduced(torch.from_numpy(labels), target, self.capture.cameras[camera])
-            return covered, self._widened(covered, LABEL_MARGIN, body.depth, target.camera)
+            return covered, _closeness(covered, body.depth, target.camera), LABEL_MARGIN
         assert tube is not None
         garment = rasterize_mesh(tube, self.tube, target.camera)
         covered = garment.faces >= 0
-        return garment.depth < body.depth, self._widened(covered, MARGIN, garment.depth, target.camera)
-
-    def _widened(
-        self, mask: Bool[Tensor, "h w"], margin: float, depth: Float[Tensor, "h w"], camera: Camera
-    ) -> Bool[Tensor, "h w"]:
-        """Return a mask with a margin in metres at the median depth of what is there."""
-        known = depth[depth.isfinite()]
-        if not len(known):
-            return mask
-        return _spread(mask.float(), math.ceil(margin * float(camera.K[0, 0] / known.median()))) > 0
+        return garment.depth < body.depth, _closeness(covered, garment.depth, target.camera), MARGIN
 
     def _texels(self, view: MeshView) -> Int64[Tensor, "h w"]:
         """Return the texel that each pixel sees of the body; -1 where there is none."""
@@ -226,6 +221,20 @@ def _texel_lookup(avatar: Avatar) -> Int64[Tensor, " g"]:
 def _spread(image: Float[Tensor, "h w"], pixels: int) -> Float[Tensor, "h w"]:
     """Return the largest value within some pixels of each."""
     return torch.nn.functional.max_pool2d(image[None, None], 2 * pixels + 1, 1, pixels)[0, 0]
+
+
+def _closeness(
+    mask: Bool[Tensor, "h w"], depth: Float[Tensor, "h w"], camera: Camera
+) -> Float[Tensor, "h w"]:
+    """Return exp(-distance / SHADE) to a mask, from 1 in it to e^-3, at the median depth of what is there."""
+    known, floor = depth[depth.isfinite()], math.exp(-3)
+    if not len(known):
+        return mask.float().clamp_min(floor)
+    pixel = float(known.median() / camera.K[0, 0])
+    closeness = mask.float()
+    for _ in range(math.ceil(3 * SHADE / pixel)):
+        closeness = closeness.maximum(math.exp(-pixel / SHADE) * _spread(closeness, 1))
+    return closeness.clamp_min(floor)
 
 
 def _reduced(mask: Bool[Tensor, "h w"], target: Target, camera: Camera) -> Bool[Tensor, "h2 w2"]:
