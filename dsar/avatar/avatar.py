@@ -164,10 +164,7 @@ class Avatar(nn.Module):
         """
         if not self.texel_hidden.any():
             return
-        body, points = self.texels_on(self.charts[:1]), self.texel_positions
-        bare = body[~self.texel_hidden[body]]
-        apart = torch.cdist(points[bare], points[self.texel_hidden]).amin(1) > BORDER
-        self._borrow_looks(self.texel_hidden, bare[apart] if apart.any() else bare)
+        self._borrow_looks(self.texel_hidden, self._bare_texels(self.texel_hidden))
         self.texel_hidden.fill_(False)
 
     @torch.no_grad()
@@ -189,13 +186,22 @@ class Avatar(nn.Module):
         harmonics = self.template.harmonics
         harmonics[seen] = 0.0
         harmonics[seen, 0] = dc_from_color(colors[seen])
-        body = self.texels_on(self.charts[:1])
-        self._borrow_looks(self.texel_guarded & ~seen, body[(seen | ~self.texel_guarded)[body]])
+        sources = torch.cat([seen.nonzero().squeeze(1), self._bare_texels(self.texel_guarded)])
+        self._borrow_looks(self.texel_guarded & ~seen, sources)
         strayed = (self.template.means - self.texel_positions).norm(dim=1) > STRAYED
         self.template.reset_shapes(self.texel_guarded & strayed, self.texel_positions, self.texel_tangents)
         logits = self.template.opacity_logits
         logits[self.texel_guarded] = logits[self.texel_guarded].clamp_min(VISIBLE_LOGIT)
         self.texel_borrowed.copy_(self.texel_guarded & ~seen)
+
+    def _bare_texels(self, beneath: Bool[Tensor, " n"]) -> Int64[Tensor, " m"]:
+        """Return the body's texels that are not beneath a garment, far enough from those to be unpainted."""
+        body, points = self.texels_on(self.charts[:1]), self.texel_positions
+        bare = body[~beneath[body]]
+        if not beneath.any():
+            return bare
+        apart = torch.cdist(points[bare], points[beneath]).amin(1) > BORDER
+        return bare[apart] if apart.any() else bare
 
     def _borrow_looks(self, which: Bool[Tensor, " n"], sources: Int64[Tensor, " m"]) -> None:
         """Give some texels the colours of the nearest of others, and let them be seen."""

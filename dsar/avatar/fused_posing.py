@@ -82,8 +82,8 @@ class _Pose(torch.autograd.Function):
 
 @kernel
 def _pose(
-    values, means, quaternions, log_scales, logits, harmonics, cells, weights, axes, transforms, bones, guarded,
-    out_means, out_rotations, out_scales, out_opacities, out_harmonics,
+    values, means, quaternions, log_scales, logits, harmonics, cells, weights, axes, transforms, bones,
+    guarded, out_means, out_rotations, out_scales, out_opacities, out_harmonics,
 ):  # fmt: skip
     """Sample the residuals of every texel, add them, activate, and pose."""
     n, bands = harmonics.shape[0], harmonics.shape[1]

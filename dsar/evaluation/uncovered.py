@@ -4,7 +4,6 @@ Where the garment would hang at rest, but the true one is lifted, an image shows
 pixels say whether a model knows that, or paints the body with its clothes.
 """
 
-import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 

@@ -85,7 +85,7 @@ class Layers:
 
     @torch.no_grad()
     def settle(self) -> None:
-        """Show what is beneath the garment, and give it the looks that it has in images; all workers at once."""
+        """Show what is beneath the garment as it looks in images; all workers must call it at once."""
         avatar = self.avatar
         avatar.unhide_covered_texels()
         if not len(self.garment):
@@ -109,17 +109,14 @@ class Layers:
 
     def frames(self) -> list[tuple[str, int]]:
         """Return sequence and frame of what is looked at: those that say where the garment is."""
-        known = [
-            (name, frame)
-            for name, clip in self.clips.items()
-            for frame in clip
-            if self.maps.has_map(name, frame) or self._labelled(name, frame)
-        ]
-        if len(known) <= FRAMES:
-            return known
-        even = known[:: math.ceil(2 * len(known) / FRAMES)]
+        everything = [(name, frame) for name, clip in self.clips.items() for frame in clip]
+        mapped = [key for key in everything if self.maps.has_map(*key)]
+        if not mapped:
+            mapped = everything[:: math.ceil(len(everything) / FRAMES)]
+            return mapped if any(self._labelled(*key) for key in mapped) else []
+        even = mapped[:: math.ceil(2 * len(mapped) / FRAMES)]
         # Every other frame at most: neighbours show the same.
-        lifted = sorted(known[::2], key=lambda key: -self._lift(*key))
+        lifted = sorted(mapped[::2], key=lambda key: -self._lift(*key))
         return even + [key for key in lifted if key not in even][: FRAMES - len(even)]
 
     def _labelled(self, sequence: str, frame: int) -> bool:
@@ -127,9 +124,7 @@ class Layers:
         return bool(cameras) and self.capture.garment_mask(sequence, frame, cameras[0]) is not None
 
     def _lift(self, sequence: str, frame: int) -> float:
-        """Return how far the garment's control points are above where they rest, metres; 0 without a map."""
-        if not self.maps.has_map(sequence, frame):
-            return 0.0
+        """Return how far the garment's control points are above where they rest, metres."""
         control = self.avatar.control
         points = self.avatar.garment_control_points()
         offsets = self.maps.offsets[sequence][frame, points]
@@ -154,8 +149,17 @@ class Layers:
             reduction = max(1, self.capture.cameras[index].width // WIDTH)
             target = load_target(self.capture, sequence, frame, index, reduction)
             body = rasterize_mesh(vertices, self.body.faces, target.camera)
+            labels = self.capture.garment_mask(sequence, frame, index)
+            if labels is not None:
+                over = _reduced(torch.from_numpy(labels), target, self.capture.cameras[index])
+                closeness, margin = _closeness(over, body.depth, target.camera), LABEL_MARGIN
+            elif tube is not None:
+                cloth = rasterize_mesh(tube, self.tube, target.camera)
+                over, margin = cloth.depth < body.depth, MARGIN
+                closeness = _closeness(cloth.faces >= 0, cloth.depth, target.camera)
+            else:
+                continue
             texels = self._texels(body)
-            over, closeness, margin = self._garment_pixels(sequence, frame, index, tube, body, target)
             whole = -_spread(-target.alpha, 1) > 1 - 1e-3
             free = whole & (closeness < math.exp(-margin / SHADE)) & (texels >= 0)
             found.colors.index_add_(0, texels[free], target.color[free] * closeness[free, None])
@@ -172,34 +176,13 @@ class Layers:
         window = self.signals[sequence].windows[[frame]]
         return self.avatar.gaussians(window, self.avatar.offset_garment(offsets))[0].means[self.garment]
 
-    def _garment_pixels(
-        self,
-        sequence: str,
-        frame: int,
-        camera: int,
-        tube: Float[Tensor, "g 3"] | None,
-        body: MeshView,
-        target: Target,
-    ) -> tuple[Bool[Tensor, "h w"], Float[Tensor, "h w"], float]:
-        """Return where a garment is before the body, `_closeness` to it, and the margin that it needs."""
-        labels = self.capture.garment_mask(sequence, frame, camera)
-        if labels is not None:
-            covered = _reduced(torch.from_numpy(labels), target, self.capture.cameras[camera])
-            return covered, _closeness(covered, body.depth, target.camera), LABEL_MARGIN
-        assert tube is not None
-        garment = rasterize_mesh(tube, self.tube, target.camera)
-        covered = garment.faces >= 0
-        return garment.depth < body.depth, _closeness(covered, garment.depth, target.camera), MARGIN
-
     def _texels(self, view: MeshView) -> Int64[Tensor, "h w"]:
         """Return the texel that each pixel sees of the body; -1 where there is none."""
         resolution = self.avatar.atlas_size[1]
         hit = view.faces >= 0
         uv = self.body.uv[self.body.uv_faces[view.faces[hit]]]
         u, v = (view.weights[hit][..., None] * uv).sum(-2).unbind(-1)
-        row, column = (
-            (t * resolution).floor().long().clamp(0, resolution - 1) for t in (1 - v, u)
-        )
+        row, column = ((t * resolution).floor().long().clamp(0, resolution - 1) for t in (1 - v, u))
         texels = torch.full_like(view.faces, -1)
         texels[hit] = self.texel_at[row * resolution + column]
         return texels
