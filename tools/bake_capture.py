@@ -1,6 +1,9 @@
 """Bake the embedded capture: choreograph, simulate the skirt, render eight views, pack.
 
     python tools/bake_capture.py --work DIR [--out DIR] [--only NAME ...] [--stage simulate|render|pack]
+    python tools/bake_capture.py --work DIR [--out DIR] [--only NAME ...] --unseen
+
+The second line simulates the unseen motions, which are not rendered, and adds them to the capture at --out.
 
 Needs the `mitsuba` extra and libLLVM >= 19. Every stage keeps its results in DIR and skips what is there.
 The same seed gives the same bytes on the same versions.
@@ -15,7 +18,8 @@ import torch
 from capture.choreography import Take, choreograph
 from capture.cloth import Fabric
 from capture.garment import drape, fit_skirt
-from capture.pack import write_capture
+from capture.pack import add_unseen, write_capture
+from capture.unseen import choreograph_unseen
 from PIL import Image
 
 from dsar.atomic_files import atomic_write
@@ -26,7 +30,7 @@ from dsar.types import Body
 ROOT = Path(__file__).resolve().parents[1]
 SEED, PRINT_SEED = 7, 5
 DISTURBANCE = 0.6
-"""Wind in m/s that makes the second true run of the test sequences."""
+"""Wind in m/s that makes the second true run of the sequences that do not train."""
 
 
 def main() -> None:
@@ -34,19 +38,27 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Bake the embedded capture.")
     parser.add_argument("--work", type=Path, required=True)
     parser.add_argument("--out", type=Path, default=ROOT / "dsar/data/embedded")
+    parser.add_argument(
+        "--unseen", action="store_true", help="add the unseen motions to the capture in --out"
+    )
     parser.add_argument("--only", nargs="*", help="sequences to bake; all by default")
     parser.add_argument("--stage", choices=("simulate", "render", "pack"), help="one stage instead of all")
     args = parser.parse_args()
     torch.set_num_threads(1)
     body = load_body()
-    takes, pair = choreograph(body, ROOT / "dsar/data/embedded_motion", SEED)
+    clips = ROOT / "dsar/data/embedded_motion"
+    takes, pair = choreograph(body, clips, SEED)
+    if args.unseen:
+        takes = choreograph_unseen(body, clips, SEED)
     takes = {name: take for name, take in takes.items() if not args.only or name in args.only}
     args.work.mkdir(parents=True, exist_ok=True)
     if args.stage in (None, "simulate"):
         simulate_takes(body, takes, args.work)
-    if args.stage in (None, "render"):
+    if args.stage in (None, "render") and not args.unseen:
         render_takes(body, takes, args.work)
-    if args.stage in (None, "pack"):
+    if args.stage in (None, "pack") and args.unseen:
+        add_unseen(args.out, args.work, body, takes)
+    elif args.stage in (None, "pack"):
         from capture.scene import build_cameras
 
         pairs = [pair] if pair.sequence in takes else []
@@ -54,10 +66,10 @@ def main() -> None:
 
 
 def simulate_takes(body: Body, takes: dict[str, Take], work: Path) -> None:
-    """Write WORK/NAME.RUN.npy for every take; test sequences have a second, slightly disturbed run."""
+    """Write WORK/NAME.RUN.npy for every take; all but training ones have a second, slightly disturbed run."""
     skirt = fit_skirt(body)
     for name, take in takes.items():
-        for run in range(2 if take.split == "test" else 1):
+        for run in range(1 if take.split == "train" else 2):
             path = work / f"{name}.{run}.npy"
             if path.exists():
                 continue

@@ -88,6 +88,7 @@ class Eval(RunCommand):
         from dsar.atomic_files import write_text_atomically
         from dsar.evaluation.heldout import evaluate
         from dsar.evaluation.report import write_report
+        from dsar.evaluation.unseen import describe_unseen
         from dsar.training.checkpoint import Run, load_checkpoint
         from dsar.training.scene import open_images
 
@@ -107,3 +108,5 @@ class Eval(RunCommand):
                     f"{split:6s} " + "  ".join(f"{key} {metrics[key]:.3f}" for key in keys) + "\n"
                 )
         sys.stdout.write(f"one-to-many {content['one_to_many']}\n")
+        for split, unseen in (figures.unseen or {}).items():
+            sys.stdout.write(describe_unseen(split, unseen) + "\n")

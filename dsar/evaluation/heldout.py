@@ -16,6 +16,7 @@ from dsar.evaluation.image_metrics import ImageMetric, load_perceptual
 from dsar.evaluation.one_to_many import one_to_many
 from dsar.evaluation.profiling import time_rollout
 from dsar.evaluation.results import HeldoutFigures, SplitMetrics, VideoMetrics, ViewMetrics, WorstView
+from dsar.evaluation.unseen import measure_unseen, unseen_missing
 from dsar.evaluation.videos import evaluate_videos
 from dsar.evaluation.view_metrics import SLOWEST, evaluate_sequence, garment_ground_truth
 from dsar.network import STREAMS, Stream
@@ -33,7 +34,8 @@ def evaluate(
 ) -> HeldoutFigures:
     """Return the held-out figures of a run.
 
-    Without one of the `streams` images are those of an ablated network; garment and times are the whole's.
+    Without one of the `streams` images and unseen motions are those of an ablated network; the garment's
+    shape and times are the whole's.
     """
     perceptual, skipped = load_perceptual()
     by_sequence = _evaluate_sequences(avatar, capture, stride, streams, perceptual)
@@ -55,6 +57,9 @@ def evaluate(
         )
     if not all(garments.values()):
         skipped["garment"] = "no simulated garment in the capture, or no garment chart in the avatar"
+    if missing_unseen := unseen_missing(avatar, capture):
+        skipped["unseen"] = missing_unseen
+    unseen = None if missing_unseen else measure_unseen(avatar, capture, streams)
     times = time_rollout(avatar, capture, capture.splits["test"][0])
     return HeldoutFigures(
         splits=splits,
@@ -65,6 +70,7 @@ def evaluate(
         parameters=sum(p.numel() for p in avatar.network.parameters()),
         one_to_many=one_to_many(avatar, capture, streams=streams),
         garment=garments,
+        unseen=unseen,
         worst=worst_views(by_sequence, capture.splits["test"]),
         skipped=skipped,
     )

@@ -72,6 +72,7 @@ def write_report(run: Run) -> Path:
         "figures": figures,
         "metrics": metrics,
         "splits": [(name, *(values.get(key) for key in metrics)) for name, values in splits.items()],
+        "unseen": list(_unseen_tables((figures or {}).get("unseen") or {})),
         "battery": battery,
         "stability": _draw_stability(battery) if battery else "",
         "study": study,
@@ -103,6 +104,25 @@ def _previews(run: Run) -> Iterator[dict[str, Any]]:
             kind = mimetypes.guess_type(name)[0] or ""
             data = f"data:{kind};base64,{base64.b64encode(path.read_bytes()).decode()}"
             yield {"title": title, "note": note, "data": data, "video": kind.startswith("video")}
+
+
+def _unseen_tables(unseen: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+    """Yield the table of each split of unseen motions, its last row the means over motions."""
+    for split, figures in unseen.items():
+        rows = [
+            (
+                name,
+                *(each[key] for key in ("mm", "mm_template", "mm_second")),
+                each["mm"] / each["mm_template"],
+            )
+            for name, each in (*figures["motions"].items(), ("mean", figures))
+        ]
+        stops = [
+            (f"{name}, frame {stop['frame']}", *(value for key, value in stop.items() if key != "frame"))
+            for name, each in figures["motions"].items()
+            for stop in each["stops"]
+        ]
+        yield {"split": split, "rows": rows, "stops": stops} | {k: figures[k] for k in ("ratio", "ratio_ci")}
 
 
 def _draw_stability(battery: Mapping[str, Any]) -> str:

@@ -102,6 +102,55 @@ class GarmentFigures:
 
 
 @dataclass(frozen=True)
+class StopFigures:
+    """What the garment does after the body has stopped, over what the skin carries."""
+
+    frame: int
+    """The first of the pose that is held."""
+    seconds: float
+    """For which it is held: a garment that has not settled by then has this as its time."""
+    settle: float
+    """Seconds until the garment stays slower than a fifth of the true speed at the stop."""
+    settle_true: float
+    overshoot: float
+    """Millimetres (rms) by which the garment swings past its final rest, the way the true one moved at the
+    stop."""
+    overshoot_true: float
+
+
+@dataclass(frozen=True)
+class UnseenMotion:
+    """The garment's points on a motion that nobody trained on: root mean square distances from the truth."""
+
+    mm: float
+    """Millimetres, over all frames and all points that the body does not hold."""
+    mm_template: float
+    """Millimetres, of the template under skinning alone."""
+    mm_second: float | None
+    """Millimetres, of another true run of the same motion; None where there is none."""
+    frames: int
+    """Of the motion."""
+    stops: Sequence[StopFigures]
+    """In order."""
+
+
+@dataclass(frozen=True)
+class UnseenFigures:
+    """The unseen motions of a split."""
+
+    motions: Mapping[str, UnseenMotion]
+    mm: float
+    """Mean over motions, as the next two."""
+    mm_template: float
+    mm_second: float | None
+    """Of the motions that have one; None where none has."""
+    ratio: float
+    """The mean of `mm` by the mean of `mm_template`."""
+    ratio_ci: tuple[float, float]
+    """Its 95 % interval by bootstrap over motions."""
+
+
+@dataclass(frozen=True)
 class FrameTimes:
     """Milliseconds a frame by stage: the network's parts, posing, rasterisation of one camera."""
 
@@ -144,6 +193,9 @@ class HeldoutFigures:
     one_to_many: OneToManyFigures | None
     garment: Mapping[str, Mapping[str, GarmentFigures] | None]
     """By test sequence: of the prediction, the template, another simulation and the truth itself."""
+    unseen: Mapping[str, UnseenFigures] | None
+    """Motions that nobody trained on: `validation`, on which choices are made, and `test`, which is only
+    reported; None where they cannot be measured."""
     worst: Sequence[WorstView]
     skipped: Mapping[str, str]
     """Why metrics were not measured."""

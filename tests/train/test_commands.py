@@ -20,8 +20,11 @@ from dsar.cli.train import Train
 from dsar.config import PRESETS
 from dsar.data.captures.formats import open_capture
 from dsar.data.motions.files import write_motion
+from dsar.evaluation import heldout
 from dsar.evaluation.report import write_report
+from dsar.evaluation.results import StopFigures, UnseenMotion
 from dsar.evaluation.stress import run_causal, run_stop
+from dsar.evaluation.unseen import summarize_motions
 from dsar.training.checkpoint import Run
 
 
@@ -163,6 +166,8 @@ def test_eval_reports_what_the_contract_names(trained, tmp_path, monkeypatch):
     assert figures["one_to_many"] is None
     assert set(figures["garment"].values()) == {None}
     assert "garment" in figures["skipped"]
+    assert figures["unseen"] is None
+    assert figures["skipped"]["unseen"] == "no unseen motions in the capture"
     assert figures["gaussians"] > 400
     assert figures["fps"] > 0
 
@@ -219,6 +224,36 @@ def test_a_run_has_a_report_that_needs_nothing_else(trained, tmp_path, monkeypat
     worst = figures["worst"]
     assert [view["psnr_box"] for view in worst] == sorted(view["psnr_box"] for view in worst)
     assert len({(view["sequence"], view["frame"]) for view in worst}) == len(worst)
+
+
+def test_unseen_motions_are_told_kept_and_shown(trained, tmp_path, monkeypatch, capsys):
+    stop = StopFigures(20, 1.5, 0.6, 1.25, 80.0, 164.0)
+    found = {
+        "validation": {
+            "leap": UnseenMotion(61.5, 123.0, 9.0, 90, [stop]),
+            "waltz": UnseenMotion(30.0, 60.0, None, 80, []),
+        },
+        "test": {"dance": UnseenMotion(77.7, 111.0, 8.0, 70, [])},
+    }
+    monkeypatch.setattr(heldout, "unseen_missing", lambda *_: None)
+    summaries = {split: summarize_motions(motions) for split, motions in found.items()}
+    monkeypatch.setattr(heldout, "measure_unseen", lambda *_: summaries)
+    shutil.copytree(trained, tmp_path / "run")
+    command("eval", tmp_path / "run", "--json", tmp_path / "eval.json")
+    figures = json.loads((tmp_path / "eval.json").read_text())
+    assert "unseen" not in figures["skipped"]
+    assert figures["unseen"]["test"]["ratio"] == pytest.approx(0.7)
+    assert figures["unseen"]["validation"]["ratio_ci"] == [0.5, 0.5]
+    assert figures["unseen"]["validation"]["motions"]["leap"] == dataclasses.asdict(
+        found["validation"]["leap"]
+    )
+    printed = capsys.readouterr().out
+    assert "unseen validation: 45.8 mm, template 91.5" in printed
+    assert "unseen test: 77.7 mm" in printed
+    page = Page((tmp_path / "run" / "report.html").read_text())
+    assert page.open == []
+    for word in ("leap", "123", "waltz", "dance", "77.7", "leap, frame 20", "1.25", "164"):
+        assert word in page.words
 
 
 def test_training_says_how_gradients_compare(trained):

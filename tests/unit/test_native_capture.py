@@ -136,7 +136,7 @@ def test_pickling_sends_a_path_and_no_images(folder):
         (("sequences", "walk", "frames"), 2, "one_to_many: walk has 2 frames, found 1-2"),
         (("fps",), 25.0, "expected 3 frames at 25 a second, found 3 at 30"),
         (("fps",), None, "expected 'fps' as int or float, found None"),
-        (("sequences", "walk", "split"), "dev", "split train or test, found 'dev'"),
+        (("sequences", "walk", "split"), "dev", "unseen_validation, unseen_test, found 'dev'"),
         (("one_to_many", 0, "at_rest"), [0, 3], "walk has 3 frames, found 0-3"),
         (("one_to_many", 0, "sequence"), "run", "no sequence 'run'"),
     ],

@@ -27,7 +27,7 @@ MOCAP = {
     "near": ("cmu_01_01", 476, 78, "test", ("nd",)),
 }
 """Name: clip, first frame, frames, split, labels."""
-_DEGREE = np.pi / 180
+DEGREE = np.pi / 180
 
 
 @dataclass(frozen=True)
@@ -98,21 +98,23 @@ def wander(frames: int, rng: np.random.Generator, amplitude: float, period: floa
     return amplitude * np.sum(waves, 0) / 3
 
 
-def _still(frames: int) -> dict[str, ndarray]:
+def stand_still(frames: int) -> dict[str, ndarray]:
+    """Return the curves of somebody who stands with the arms hanging."""
     ones = np.ones((frames, 2))
     return {
         "heading": np.zeros(frames),
         "rise": np.zeros(frames),
         "shift": 0 * ones,
-        "abduction": 24 * _DEGREE * ones,
+        "abduction": 24 * DEGREE * ones,
         "swing": 0.05 * ones,
-        "elbow": 18 * _DEGREE * ones,
+        "elbow": 18 * DEGREE * ones,
         "lean": 0 * ones,
         "twist": np.zeros(frames),
     }
 
 
-def _vary(curves: dict[str, ndarray], rng: np.random.Generator) -> None:
+def vary(curves: dict[str, ndarray], rng: np.random.Generator) -> None:
+    """Add the slow variation of a living body to arms, trunk and pelvis, in place."""
     frames = len(curves["rise"])
     for name, amplitude in (("abduction", 0.06), ("swing", 0.10), ("elbow", 0.12), ("lean", 0.035)):
         curves[name] = curves[name] + np.stack([wander(frames, rng, amplitude) for _ in range(2)], -1)
@@ -120,18 +122,18 @@ def _vary(curves: dict[str, ndarray], rng: np.random.Generator) -> None:
     curves["twist"] = curves["twist"] + wander(frames, rng, 0.06)
 
 
-def _hold_arms(curves: dict[str, ndarray], raised: float, bent: float) -> None:
+def hold_arms(curves: dict[str, ndarray], raised: float, bent: float) -> None:
     """Hold the arms out from the first frame to the last, whatever the body does."""
     curves["abduction"] = np.full_like(curves["abduction"], raised)
     curves["elbow"] = curves["elbow"] + bent
 
 
-def _react_to_spin(curves: dict[str, ndarray], raised: float, bent: float) -> None:
+def react_to_spin(curves: dict[str, ndarray], raised: float, bent: float) -> None:
     """Raise and trail the arms with the spin's speed, and let the shoulders lead into a turn."""
     speed = np.gradient(curves["heading"]) * FPS / (2 * np.pi)
     smooth = np.convolve(np.pad(np.abs(speed), 6, mode="edge"), np.hanning(15)[1:-1] / 7, "valid")
     effort = np.clip(smooth, 0, 1.2)[:, None]
-    curves["abduction"] = curves["abduction"] + effort * (raised - 24 * _DEGREE)
+    curves["abduction"] = curves["abduction"] + effort * (raised - 24 * DEGREE)
     curves["elbow"] = curves["elbow"] + effort * bent
     curves["rise"] = curves["rise"] - 0.015 * effort[:, 0]
     surge = np.convolve(np.pad(np.gradient(speed), 4, mode="edge"), np.hanning(11)[1:-1] / 5, "valid")
@@ -159,7 +161,7 @@ def jump_curve(frames: int, start: int, height: float) -> Curve:
 def _sway(rng: np.random.Generator) -> dict[str, ndarray]:
     frames = 100
     t = np.arange(frames)
-    curves = _still(frames)
+    curves = stand_still(frames)
     ease = key_curve(frames, (4, 0), (20, 1), (76, 1), (86, 0))
     phase = 2 * np.pi * (t - 4) / 36
     curves["shift"][:, 0] = 0.10 * ease * np.sin(phase)
@@ -169,9 +171,9 @@ def _sway(rng: np.random.Generator) -> dict[str, ndarray]:
     curves["rise"] = -0.03 * ease * np.cos(phase) ** 2
     curves["swing"] = ease[:, None] * 0.55 * np.stack([np.sin(phase), -np.sin(phase)], -1)
     raised = key_curve(frames, (24, 0), (38, 1), (58, 1), (72, 0))[:, None]
-    curves["abduction"] = curves["abduction"] + raised * 30 * _DEGREE
+    curves["abduction"] = curves["abduction"] + raised * 30 * DEGREE
     curves["elbow"] = curves["elbow"] + 0.25 * ease[:, None]
-    _vary(curves, rng)
+    vary(curves, rng)
     return curves
 
 
@@ -183,58 +185,58 @@ def _spin(
     bent: float,
     rng: np.random.Generator,
 ) -> dict[str, ndarray]:
-    curves = _still(frames)
+    curves = stand_still(frames)
     curves["heading"], _ = spin_curve(frames, *spins)
-    arms(curves, raised * _DEGREE, bent)
-    _vary(curves, rng)
+    arms(curves, raised * DEGREE, bent)
+    vary(curves, rng)
     return curves
 
 
 def _twists(rng: np.random.Generator) -> dict[str, ndarray]:
     frames = 112
-    curves = _still(frames)
+    curves = stand_still(frames)
     half = np.pi
     curves["heading"] = key_curve(
         frames, (6, 0), (19, half), (30, half), (43, 0), (56, 0), (66, -half), (78, -half), (88, 0)
     )
-    _react_to_spin(curves, 40 * _DEGREE, 0.5)
-    _vary(curves, rng)
+    react_to_spin(curves, 40 * DEGREE, 0.5)
+    vary(curves, rng)
     return curves
 
 
 def _jumps(rng: np.random.Generator) -> dict[str, ndarray]:
     frames = 104
-    curves = _still(frames)
+    curves = stand_still(frames)
     curves["rise"] = jump_curve(frames, 6, 0.16) + jump_curve(frames, 58, 0.22)
     crouch = np.clip(-curves["rise"], 0, 1)[:, None]
     curves["lean"] = curves["lean"] + crouch * np.array([2.2, 0.0])
     curves["swing"] = curves["swing"] - 3.0 * crouch + 2.0 * np.clip(curves["rise"], 0, 1)[:, None]
     curves["heading"] = key_curve(frames, (60, 0), (80, 0.5), (90, 0.5))
-    _vary(curves, rng)
+    vary(curves, rng)
     return curves
 
 
 def _spin_and_jump(rng: np.random.Generator) -> dict[str, ndarray]:
     frames = 118
-    curves = _still(frames)
+    curves = stand_still(frames)
     curves["heading"], ends = spin_curve(frames, (6, 1.0, 1.3))
-    _hold_arms(curves, 42 * _DEGREE, 0.3)
+    hold_arms(curves, 42 * DEGREE, 0.3)
     curves["rise"] = curves["rise"] + jump_curve(frames, ends[0] + 26, 0.18)
-    _vary(curves, rng)
+    vary(curves, rng)
     return curves
 
 
 def _far() -> tuple[dict[str, ndarray], OneToMany]:
     frames = 160
-    curves = _still(frames)
+    curves = stand_still(frames)
     curves["heading"], ends = spin_curve(frames, (20, 2.0, 1.5))
-    _hold_arms(curves, 50 * _DEGREE, 0.35)
+    hold_arms(curves, 50 * DEGREE, 0.35)
     stop = ends[0]
     curves["rise"] = curves["rise"] + jump_curve(frames, stop + 46, 0.18)
     return curves, OneToMany("far", (stop, stop + 44), (0, 12))
 
 
-def _cut_mocap(path: Path, body: Body, first: int, frames: int, name: str) -> Motion:
+def cut_mocap(path: Path, body: Body, first: int, frames: int, name: str) -> Motion:
     """Return a piece of a clip with the middle of its walked area over the stage's centre."""
     piece = read_motion(path, body).slice(first, first + frames)
     pelvis = piece.translations + body.joints[0]
@@ -255,9 +257,9 @@ def choreograph(body: Body, clips: Path, seed: int) -> tuple[Mapping[str, Take],
     far, pair = _far()
     train = {
         "sway": _sway(rng),
-        "spin_left": _spin(98, [(8, 1.5, 1.2)], _hold_arms, 62, 0.2, rng),
-        "spin_right": _spin(100, [(8, -2.0, 1.6)], _react_to_spin, 38, 0.9, rng),
-        "spin_both": _spin(138, [(6, 1.0, 0.8), (78, -1.0, 1.4)], _hold_arms, 50, 0.5, rng),
+        "spin_left": _spin(98, [(8, 1.5, 1.2)], hold_arms, 62, 0.2, rng),
+        "spin_right": _spin(100, [(8, -2.0, 1.6)], react_to_spin, 38, 0.9, rng),
+        "spin_both": _spin(138, [(6, 1.0, 0.8), (78, -1.0, 1.4)], hold_arms, 50, 0.5, rng),
         "twists": _twists(rng),
         "jumps": _jumps(rng),
         "spin_jump": _spin_and_jump(rng),
@@ -269,7 +271,7 @@ def choreograph(body: Body, clips: Path, seed: int) -> tuple[Mapping[str, Take],
         for name, curves in train.items()
     }
     for name, (clip, first, frames, split, labels) in MOCAP.items():
-        piece = _cut_mocap(clips / f"{clip}.npz", body, first, frames, name)
+        piece = cut_mocap(clips / f"{clip}.npz", body, first, frames, name)
         takes[name] = Take(piece, split, labels)
     takes["far"] = Take(compose_motion(Score(**far), joints, ground, FPS, "far"), "test", ("fd",))
     return takes, pair

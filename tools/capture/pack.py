@@ -64,6 +64,25 @@ def write_capture(
     write_text_atomically(out / "capture.json", json.dumps(record, indent=1) + "\n")
 
 
+def add_unseen(out: Path, work: Path, body: Body, takes: Mapping[str, Take]) -> None:
+    """Add motion and garment of takes without images to a capture; what it has keeps its bytes.
+
+    Args:
+        out: A capture folder that `write_capture` made.
+        work: Where the simulation left NAME.RUN.npy.
+        body: The embedded body.
+        takes: Unseen motions by name; those that the capture has already are written anew.
+    """
+    for name, take in takes.items():
+        write_motion(out / "motion" / f"{name}.npz", take.motion, body)
+        _write_garment(out / "garment" / f"{name}.npz", sorted(work.glob(f"{name}.[0-9].npy")))
+    record = json.loads((out / "capture.json").read_text())
+    record["sequences"] |= {
+        name: _describe_take(name, take) | {"images": None} for name, take in takes.items()
+    }
+    write_text_atomically(out / "capture.json", json.dumps(record, indent=1) + "\n")
+
+
 def _describe_camera(camera: Camera) -> dict[str, object]:
     return {
         "name": camera.name,

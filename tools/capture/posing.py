@@ -1,6 +1,7 @@
 """From a handful of readable curves (heading, height, arms, lean) to SMPL-X joint rotations.
 
-Feet are planted by two-bone inverse kinematics; they step when the heading leaves them behind.
+Feet are planted by two-bone inverse kinematics; they step when the heading leaves them behind, or go where
+the score says (`capture.gait` plans them for walks).
 World: metres, Y up, person facing +Z at heading zero, angles in radians.
 """
 
@@ -26,6 +27,18 @@ Curve = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
+class Feet:
+    """Where both feet are over time, left and right in the second axis; the stage's frame, Y up."""
+
+    place: Float[ndarray, "f 2 3"]
+    """Ankles: x and z on the stage, y above where they are in standing; metres."""
+    yaw: Float[ndarray, "f 2"]
+    """Where the toes point, radians, as the heading."""
+    pitch: Float[ndarray, "f 2"]
+    """How far the toes point down (below zero: up), radians."""
+
+
+@dataclass(frozen=True)
 class Score:
     """The curves of one authored sequence, one value a frame; left and right where there are two columns."""
 
@@ -45,6 +58,10 @@ class Score:
     """Bend of the trunk forward and to the left."""
     twist: Float[ndarray, " f"]
     """Yaw of the shoulders against the pelvis."""
+    travel: Float[ndarray, "f 2"] | None = None
+    """Way of the pelvis on the stage, x and z in metres; None stays in the centre."""
+    feet: Feet | None = None
+    """Feet that go where they should; None stands in the centre and steps under the heading."""
 
 
 def rotate(axis: int, angle: Float[ndarray, " f"]) -> Float[ndarray, "f 3 3"]:
@@ -80,6 +97,11 @@ def compose_motion(
     shift = np.stack([score.shift[:, 0], np.zeros(frames), score.shift[:, 1]], -1)
     pelvis = np.einsum("fij,fj->fi", yaw, shift)
     pelvis[:, 1] += joints[PELVIS, 1] - ground - 0.015 + score.rise
+    if score.travel is not None:
+        pelvis[:, [0, 2]] += score.travel
+    feet = score.feet or _step_on_the_spot(score)
+    if score.feet is not None:
+        pelvis[:, 1] -= _missing_reach(local, pelvis, feet, joints, ground)
     for joint in SPINES:
         bend = rotate(0, 0.22 * score.lean[:, 0]) @ rotate(2, 0.22 * score.lean[:, 1])
         local[:, joint] = bend @ rotate(1, score.twist / 3)
@@ -88,7 +110,7 @@ def compose_motion(
     local[:, HEAD] = rotate(0, -0.2 * score.lean[:, 0]) @ rotate(2, -0.4 * score.lean[:, 1])
     _pose_arms(local, score)
     for side, leg in enumerate(LEGS):
-        _plant_leg(local, score, joints, ground, pelvis, side, leg)
+        _plant_leg(local, score.heading, feet, joints, ground, pelvis, side, leg)
     rotations = axis_angle_from_matrix(torch.from_numpy(local)).float()
     return Motion(rotations, torch.from_numpy(pelvis - joints[PELVIS]).float(), fps, name)
 
@@ -104,9 +126,46 @@ def _pose_arms(local: Float[ndarray, "f j 3 3"], score: Score) -> None:
         local[:, list(FINGERS[side])] = rotate(2, -mirror * 0.3 * still)[:, None]
 
 
+def _step_on_the_spot(score: Score) -> Feet:
+    """Return feet that stay under the centre, step as the heading turns, and leave the ground in jumps."""
+    flight = np.maximum(score.rise, 0.0)
+    place, yaws, pitches = [], [], []
+    for mirror in (1.0, -1.0):
+        yaw, lift = _step_foot(score.heading, mirror)
+        ankle = np.einsum("fij,j->fi", rotate(1, _wrap_angle(yaw)), np.array([mirror * 0.105, 0.0, 0.0]))
+        ankle[:, 1] = 0.06 * lift + flight
+        place.append(ankle)
+        yaws.append(yaw)
+        pitches.append(np.clip(3.0 * flight + 0.35 * lift, 0.0, 0.7))
+    return Feet(np.stack(place, 1), np.stack(yaws, -1), np.stack(pitches, -1))
+
+
+def _missing_reach(
+    local: Float[ndarray, "f j 3 3"],
+    pelvis: Float[ndarray, "f 3"],
+    feet: Feet,
+    joints: Float[ndarray, "j 3"],
+    ground: float,
+) -> Curve:
+    """Return how far the pelvis must come down for both legs to reach their feet, smooth in time; metres."""
+    missing = np.zeros(len(pelvis))
+    for side, (hip, knee, ankle) in enumerate(LEGS):
+        offset = joints[hip] - joints[PELVIS]
+        hip_world = pelvis + np.einsum("fij,j->fi", local[:, PELVIS], offset)
+        length = np.linalg.norm(joints[knee] - joints[hip]) + np.linalg.norm(joints[ankle] - joints[knee])
+        away = feet.place[:, side, [0, 2]] - hip_world[:, [0, 2]]
+        height = np.sqrt(np.maximum((0.995 * length) ** 2 - np.sum(away**2, 1), 0.01))
+        ankle_height = joints[ankle, 1] - ground + feet.place[:, side, 1]
+        missing = np.maximum(missing, hip_world[:, 1] - height - ankle_height)
+    # The largest of three frames, then their weighted mean: never less than what is missing by much.
+    largest = np.lib.stride_tricks.sliding_window_view(np.pad(missing, 1, mode="edge"), 3).max(1)
+    return np.convolve(np.pad(largest, 2, mode="edge"), np.array([1, 3, 4, 3, 1]) / 12, "valid")
+
+
 def _plant_leg(
     local: Float[ndarray, "f j 3 3"],
-    score: Score,
+    heading: Curve,
+    feet: Feet,
     joints: Float[ndarray, "j 3"],
     ground: float,
     pelvis: Float[ndarray, "f 3"],
@@ -114,13 +173,11 @@ def _plant_leg(
     leg: tuple[int, int, int],
 ) -> None:
     hip, knee, ankle = leg
-    mirror = 1.0 if side == 0 else -1.0
-    yaw, lift = _step_foot(score.heading, mirror)
-    flight = np.maximum(score.rise, 0.0)
+    yaw = feet.yaw[:, side]
     foot = rotate(1, _wrap_angle(yaw))
-    target = np.einsum("fij,j->fi", foot, np.array([mirror * 0.105, 0.0, 0.0]))
-    target[:, 1] = joints[ankle, 1] - ground + 0.06 * lift + flight
-    knees_ahead = rotate(1, _wrap_angle(0.5 * (yaw + score.heading)))[:, :, 2]
+    target = feet.place[:, side].copy()
+    target[:, 1] += joints[ankle, 1] - ground
+    knees_ahead = rotate(1, _wrap_angle(0.5 * (yaw + heading)))[:, :, 2]
     hip_world = pelvis + np.einsum("fij,j->fi", local[:, PELVIS], joints[hip] - joints[PELVIS])
     thigh, shin = joints[knee] - joints[hip], joints[ankle] - joints[knee]
     directions = _bend_leg(
@@ -132,8 +189,7 @@ def _plant_leg(
     )
     local[:, hip] = np.swapaxes(local[:, PELVIS], 1, 2) @ world_thigh
     local[:, knee] = np.swapaxes(world_thigh, 1, 2) @ world_shin
-    pointed = rotate(0, np.clip(3.0 * flight + 0.35 * lift, 0.0, 0.7))
-    local[:, ankle] = np.swapaxes(world_shin, 1, 2) @ foot @ pointed
+    local[:, ankle] = np.swapaxes(world_shin, 1, 2) @ foot @ rotate(0, feet.pitch[:, side])
 
 
 def _step_foot(heading: Curve, mirror: float) -> tuple[Curve, Curve]:

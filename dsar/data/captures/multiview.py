@@ -18,6 +18,12 @@ from dsar.geometry.cameras import farthest_cameras
 from dsar.geometry.frame_numbers import parse_frame_range
 from dsar.types import Body, Camera, Motion
 
+FILMED_SPLITS = ("train", "test")
+"""Splits of sequences with images."""
+UNSEEN_SPLITS = ("unseen_validation", "unseen_test")
+"""Splits of unseen motions: never trained on, without images, with the garment's truth. The first is for
+choosing between methods, the second is only ever reported."""
+
 
 @runtime_checkable
 class Views(Protocol):
@@ -90,9 +96,10 @@ class MultiViewCapture:
     motions: Mapping[str, Motion]
     """Body motion of each sequence, by sequence name."""
     splits: Mapping[str, Sequence[str]]
-    """Sequence names of `train` and `test` and of each label such as `nd`, `fd`."""
+    """Sequence names of `train` and `test`, of each label such as `nd`, `fd`, and of `unseen_validation` and
+    `unseen_test` where there are unseen motions."""
     views: Mapping[str, Views] = field(repr=False)
-    """The images of each sequence."""
+    """The images of each sequence; unseen motions have none."""
     reopen: Callable[[], "MultiViewCapture"] = field(repr=False)
     """Opens the same folder in the same way, all cameras; survives pickling."""
     one_to_many: Sequence[OneToMany] = ()
@@ -115,7 +122,8 @@ class MultiViewCapture:
         if not self.backdrop:
             return 0
         pixels = sum(camera.width * camera.height for camera in self.cameras)
-        return min(CACHE_BYTES, 4 * pixels * sum(map(len, self.motions.values())))
+        frames = sum(len(motion) for name, motion in self.motions.items() if name in self.views)
+        return min(CACHE_BYTES, 4 * pixels * frames)
 
     def with_cameras(self, count: int | None) -> "MultiViewCapture":
         """Return the capture as seen by some of its cameras, spread as far as can be; None: by all."""
@@ -128,6 +136,8 @@ class MultiViewCapture:
     def with_frames(self, train: str | None, test: str | None) -> "MultiViewCapture":
         """Return the capture with some frames of each training and each test sequence only; None: with all.
 
+        Unseen motions stay whole.
+
         Raises:
             ConfigError: a range is not of the form 0-239.
             CaptureError: no frames are left to train with, or to test.
@@ -138,6 +148,11 @@ class MultiViewCapture:
             name: parse_frame_range(text, len(self.motions[name]))
             for split, text in (("train", train), ("test", test))
             for name in self.splits[split]
+        }
+        chosen |= {
+            name: range(len(self.motions[name]))
+            for split in UNSEEN_SPLITS
+            for name in self.splits.get(split, ())
         }
         chosen = {name: frames for name, frames in chosen.items() if len(frames)}
         splits = {
@@ -160,7 +175,9 @@ class MultiViewCapture:
         )
 
     def cameras_with_image(self, sequence: str, frame: int) -> list[int]:
-        """Return the cameras that have an image of a frame with its mask."""
+        """Return the cameras that have an image of a frame with its mask; none of an unseen motion."""
+        if sequence not in self.views:
+            return []
         views, number = self.views[sequence], frame + self.starts.get(sequence, 0)
         return [index for index, camera in enumerate(self.cameras) if views.has(camera, number)]
 
@@ -179,6 +196,8 @@ class MultiViewCapture:
             raise CaptureError(
                 f"capture {self.name}, {sequence}: no frame {frame}; there are 0 to {frames - 1}"
             )
+        if sequence not in self.views:
+            raise CaptureError(f"capture {self.name}, {sequence}: an unseen motion has no images")
         return self.views[sequence].read(view, frame + self.starts.get(sequence, 0))
 
     def garment_mask(self, sequence: str, frame: int, camera: int) -> Bool[np.ndarray, "h w"] | None:

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dsar.body.files import choose_body, load_body
-from dsar.data.captures.multiview import MultiViewCapture, OneToMany
+from dsar.data.captures.multiview import FILMED_SPLITS, UNSEEN_SPLITS, MultiViewCapture, OneToMany
 from dsar.data.folders import check_name, find_file, inside
 from dsar.data.images.conversions import ConversionLog
 from dsar.data.images.cutouts import Cutouts
@@ -25,6 +25,7 @@ from dsar.types import Body, Camera, Motion
 
 RECORD_NAME = "capture.json"
 FORMAT, VERSION = "dsar-capture", 1
+_SPLITS = (*FILMED_SPLITS, *UNSEEN_SPLITS)
 T = TypeVar("T")
 LOGGER = logging.getLogger(__name__)
 
@@ -58,14 +59,14 @@ def open_native(root: Path, body: Path | None = None) -> MultiViewCapture:
         check_name(f"{where}, sequences", name)
     splits = _read_splits(sequences, where)
     pairs = tuple(_read_pair(entry, sequences, where) for entry in record.get("one_to_many", []))
-    images, garments, label = {}, {}, _get(record, "name", str, where)
+    label = _get(record, "name", str, where)
+    images, garments = {}, _read_garments(root, sequences, where)
     conversions = ConversionLog(label)
     for name, entry in sequences.items():
         at = f"{where}, sequence {name}"
-        images[name] = Cutouts(inside(at, root, _get(entry, "images", str, at)), conversions)
-        images[name].check(cameras, _get(entry, "frames", int, at))
-        if entry.get("garment"):
-            garments[name] = inside(at, root, _get(entry, "garment", str, at))
+        if entry["split"] not in UNSEEN_SPLITS:
+            images[name] = Cutouts(inside(at, root, _get(entry, "images", str, at)), conversions)
+            images[name].check(cameras, _get(entry, "frames", int, at))
     recorded = inside(str(where), root, _get(record, "body", str, where)) if record.get("body") else None
     body_path = choose_body(body, "neutral") if body else recorded
     if body_path != recorded:
@@ -150,22 +151,47 @@ def _read_sequence_motion(root: Path, name: str, entry: Mapping[str, Any], body:
 
 
 def _read_splits(sequences: Mapping[str, Mapping[str, Any]], where: Path) -> dict[str, tuple[str, ...]]:
-    splits: dict[str, list[str]] = {"train": [], "test": []}
+    splits: dict[str, list[str]] = {split: [] for split in FILMED_SPLITS}
     for name, entry in sequences.items():
-        split = entry.get("split")
-        if split not in ("train", "test"):
-            raise CaptureError(f"{where}, sequence {name}: expected split train or test, found {split!r}")
-        for label in (split, *entry.get("labels", [])):
+        split, labels = entry.get("split"), entry.get("labels", [])
+        if split not in _SPLITS:
+            expected = ", ".join(_SPLITS)
+            raise CaptureError(
+                f"{where}, sequence {name}: expected split as one of {expected}, found {split!r}"
+            )
+        if split in UNSEEN_SPLITS and (entry.get("images") is not None or labels):
+            raise CaptureError(
+                f"{where}, sequence {name}: expected no images and no labels of split {split}; write "
+                '"images": null, or put it into split test'
+            )
+        if reserved := sorted(set(labels) & set(_SPLITS)):
+            raise CaptureError(f"{where}, sequence {name}: {reserved[0]} is a split, not a label")
+        for label in (split, *labels):
             splits.setdefault(label, []).append(name)
     return {label: tuple(names) for label, names in splits.items()}
+
+
+def _read_garments(root: Path, sequences: Mapping[str, Mapping[str, Any]], where: Path) -> dict[str, Path]:
+    """Return the files of the garment's truth, of the sequences that have one; unseen motions must."""
+    garments = {}
+    for name, entry in sequences.items():
+        at, unseen = f"{where}, sequence {name}", entry["split"] in UNSEEN_SPLITS
+        if entry.get("garment") or unseen:
+            garments[name] = inside(at, root, _get(entry, "garment", str, at))
+        if unseen and not garments[name].is_file():
+            raise CaptureError(f"{at}: an unseen motion needs its garment; there is no {garments[name]}")
+    return garments
 
 
 def _read_pair(
     entry: Mapping[str, Any], sequences: Mapping[str, Mapping[str, Any]], where: Path
 ) -> OneToMany:
     name = _get(entry, "sequence", str, f"{where}, one_to_many")
-    if name not in sequences:
-        raise CaptureError(f"{where}, one_to_many: no sequence {name!r}; there are {', '.join(sequences)}")
+    filmed = [each for each, entry in sequences.items() if entry["split"] not in UNSEEN_SPLITS]
+    if name not in filmed:
+        raise CaptureError(
+            f"{where}, one_to_many: no sequence {name!r} with images; there are {', '.join(filmed)}"
+        )
     frames = _get(sequences[name], "frames", int, f"{where}, sequence {name}")
     ranges = [tuple(_get(entry, key, list, f"{where}, one_to_many")) for key in ("after_stop", "at_rest")]
     for first, last in ranges:

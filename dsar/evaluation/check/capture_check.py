@@ -24,6 +24,7 @@ from dsar.evaluation.check.image_summaries import (
 )
 from dsar.evaluation.check.silhouettes import FINE, Mask, SilhouetteAgreement, compare, load_masks, read
 from dsar.evaluation.check.verdict import CameraAgreement, CaptureFigures, CaptureVerdict, MotionDistance
+from dsar.types import Motion
 
 _FINE_CAMERAS = 8
 """Cameras whose masks are looked at in full size, at most."""
@@ -77,7 +78,7 @@ def check_capture(capture: MultiViewCapture, report: Reporter = lambda *_: None)
 def _gap_findings(capture: MultiViewCapture, seen: Collection[tuple[str, int]]) -> list[Finding]:
     """Return which sequences have frames that no camera saw."""
     findings = []
-    for name, motion in capture.motions.items():
+    for name, motion in _filmed(capture).items():
         unseen = [frame for frame in range(len(motion)) if (name, frame) not in seen]
         if unseen:
             what = f"sequence {name}: no camera has an image of {len(unseen)} of {len(motion)} frames: "
@@ -85,6 +86,11 @@ def _gap_findings(capture: MultiViewCapture, seen: Collection[tuple[str, int]]) 
             everything = len(unseen) == len(motion)
             findings.append(Finding("unseen_frames", what + _list(unseen) + advice, everything))
     return findings
+
+
+def _filmed(capture: MultiViewCapture) -> dict[str, Motion]:
+    """Return the motions of which there should be images: all but the unseen ones."""
+    return {name: motion for name, motion in capture.motions.items() if name in capture.views}
 
 
 def _image_findings(
@@ -149,7 +155,7 @@ def _by_camera(
     agreements: Sequence[SilhouetteAgreement],
     summaries: Sequence[ImageSummary],
 ) -> list[CameraAgreement]:
-    frames, verdicts = sum(map(len, capture.motions.values())), []
+    frames, verdicts = sum(map(len, _filmed(capture).values())), []
     for index, camera in enumerate(capture.cameras):
         own = [each for mask, each in zip(masks, agreements, strict=True) if mask.camera == index]
         count = sum(summary.camera == index for summary in summaries)

@@ -8,12 +8,13 @@ from dsar.evaluation.study.runner import Study
 from dsar.evaluation.study.tables import Row, Table
 
 _IMAGE = ("psnr", "psnr_box", "psnr_garment", "ssim", "lpips", "lpips_vgg", "flip", "tpsnr", "vmaf")
-_COLUMNS = (*_IMAGE, "correlation", "fps", "gaussians", "passed", "updates", "minutes")
+_COLUMNS = (*_IMAGE, "correlation", "unseen", "fps", "gaussians", "passed", "updates", "minutes")
 _DIGITS = {
     "ssim": 4,
     "lpips": 4,
     "lpips_vgg": 4,
     "flip": 4,
+    "unseen": 3,
     "fps": 0,
     "gaussians": 0,
     "updates": 0,
@@ -78,8 +79,11 @@ def _columns_of(figures: Mapping[str, Any], split: str) -> dict[str, float | Non
     # A capture that labels no sequence as far has its test split judged in its place.
     images = figures["splits"].get(split) or figures["splits"]["test"]
     pairs, battery = figures["one_to_many"], figures.get("stress")
+    # Models that were measured before there were unseen motions have no such figure.
+    unseen = (figures.get("unseen") or {}).get("test")
     return {key: images[key] for key in _IMAGE} | {
         "correlation": pairs and pairs["correlation"],
+        "unseen": unseen and unseen["ratio"],
         "fps": figures["fps"],
         "gaussians": figures["gaussians"],
         "passed": None if battery is None else sum(c["pass"] for c in battery.values()) / len(battery),
