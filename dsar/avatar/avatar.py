@@ -47,7 +47,9 @@ class Avatar(nn.Module):
     texel_tangents: Tensor
     texel_hidden: Tensor
     texel_guarded: Tensor
+    """Texels of the body that a garment covers at times: their looks do not change any more."""
     texel_borrowed: Tensor
+    """Those of them that were never seen without one, and have the looks of others."""
     texel_axes: Tensor
     body_joints: Tensor
 
@@ -105,6 +107,12 @@ class Avatar(nn.Module):
     def num_gaussians(self) -> int:
         """Gaussians of every frame."""
         return len(self.texels)
+
+    @property
+    def borrowed_share(self) -> float | None:
+        """Share of the guarded texels that never were seen without a garment; None without any."""
+        guarded = int(self.texel_guarded.sum())
+        return int(self.texel_borrowed.sum()) / guarded if guarded else None
 
     def texels_on(self, charts: Sequence[Chart]) -> Int64[Tensor, " g"]:
         """Return which Gaussians lie on some of the charts."""

@@ -193,6 +193,9 @@ class HeldoutFigures:
     one_to_many: OneToManyFigures | None
     garment: Mapping[str, Mapping[str, GarmentFigures] | None]
     """By test sequence: of the prediction, the template, another simulation and the truth itself."""
+    borrowed: float | None
+    """Share of the body's texels beneath garments that training never saw without one, and that look as the
+    nearest that it saw; None where no garment covers any."""
     unseen: Mapping[str, UnseenFigures] | None
     """Motions that nobody trained on: `validation`, on which choices are made, and `test`, which is only
     reported; None where they cannot be measured."""

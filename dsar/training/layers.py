@@ -104,7 +104,7 @@ class Layers:
         LOGGER.info(
             "Beneath the garment: %d texels, %.0f %% of them never seen without it: they look as the nearest "
             "that was",
-            *(guarded, 100 * borrowed_share(avatar)),
+            *(guarded, 100 * (avatar.borrowed_share or 0.0)),
         )
 
     def frames(self) -> list[tuple[str, int]]:
@@ -186,11 +186,6 @@ class Layers:
         texels = torch.full_like(view.faces, -1)
         texels[hit] = self.texel_at[row * resolution + column]
         return texels
-
-
-def borrowed_share(avatar: Avatar) -> float:
-    """Return the share of the texels beneath garments that never were seen without one; 0 without any."""
-    return float(avatar.texel_borrowed.sum() / avatar.texel_guarded.sum().clamp_min(1))
 
 
 def _texel_lookup(avatar: Avatar) -> Int64[Tensor, " g"]:

@@ -15,7 +15,7 @@ from dsar.geometry.harmonics import color_from_harmonics
 from dsar.network import NetworkOutput
 from dsar.raster.mesh import rasterize_mesh
 from dsar.training.chunk import ChunkTrainer
-from dsar.training.layers import FRAMES, Layers, borrowed_share
+from dsar.training.layers import FRAMES, Layers
 from dsar.training.optimizers import keep_still, set_rates
 from dsar.training.registered_maps import RegisteredMaps
 from dsar.training.schedule import ScheduleState
@@ -107,7 +107,7 @@ def test_what_is_beneath_learns_from_bare_pixels_alone(capture, avatar, signals,
     guarded, borrowed = avatar.texel_guarded, avatar.texel_borrowed
     assert guarded[hidden].all()
     assert not guarded[avatar.garment_texels()].any()
-    assert 0 < borrowed_share(avatar) < 0.8
+    assert 0 < avatar.borrowed_share < 0.8
     learnt = colors_of(avatar)[guarded & ~borrowed]
     assert len(learnt) > 100
     assert torch.allclose(learnt, SKIN.expand_as(learnt), atol=0.01), "a garment's colour came through"
@@ -138,7 +138,7 @@ def test_without_maps_or_labels_the_nearest_skin_beyond_the_border_is_taken(capt
     assert not hidden[sources].any()
     assert torch.cdist(points[sources], points[hidden]).amin() > BORDER
     assert torch.equal(avatar.texel_guarded, hidden)
-    assert borrowed_share(avatar) == 1
+    assert avatar.borrowed_share == 1
 
 
 def test_a_gaussian_that_strayed_from_the_body_comes_back(avatar):

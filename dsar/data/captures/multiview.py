@@ -206,7 +206,7 @@ class MultiViewCapture:
         Raises:
             CaptureError: The labels cannot be read.
         """
-        views = self.views[sequence]
+        views = self.views.get(sequence)
         if not isinstance(views, LabelledViews):
             return None
         return views.garment_mask(self.cameras[camera], frame + self.starts.get(sequence, 0))
