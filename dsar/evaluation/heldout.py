@@ -56,9 +56,7 @@ def evaluate(
             else "the capture does not say where the garment is, or it never leaves the body free"
         )
     if avatar.borrowed_share is None:
-        skipped["borrowed"] = (
-            "no garment covers any of the avatar's body, or it was trained before this was kept"
-        )
+        skipped["borrowed"] = "no garment covers the avatar's body, or it was trained before this was kept"
     if not all(garments.values()):
         skipped["garment"] = "no simulated garment in the capture, or no garment chart in the avatar"
     if missing_unseen := unseen_missing(avatar, capture):

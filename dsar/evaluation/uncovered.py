@@ -22,15 +22,21 @@ FEWEST = 16
 class RestingGarment:
     """A garment that only hangs on the skeleton: the avatar's chart of it, as far down as it was seen."""
 
-    def __init__(self, avatar: Avatar) -> None:
-        """Take the last garment's chart; the avatar must have one."""
-        chart, columns = avatar.garments[-1], avatar.atlas_size[1]
-        texels = avatar.texels_on([chart])
-        heights = avatar.texel_positions[texels, 1].unflatten(0, (len(chart.rows), columns))[:, 0]
-        rows = int((heights >= heights[-1] + PAST_HEM).sum())
-        self._texels, self._faces = texels[: rows * columns], tube_faces(rows, columns)
-        self._positions = avatar.texel_positions[self._texels]
-        self._weights = avatar.texel_weights[self._texels]
+    def __init__(self, positions: Float[Tensor, "r c 3"], weights: Float[Tensor, "r c j"]) -> None:
+        """Take a tube's rest positions, metres, and skin weights; rows from waist to hem."""
+        kept = int((positions[:, 0, 1] >= positions[-1, 0, 1] + PAST_HEM - 1e-5).sum())
+        self._faces = tube_faces(kept, positions.shape[1])
+        self._positions, self._weights = positions[:kept].flatten(0, 1), weights[:kept].flatten(0, 1)
+
+    @classmethod
+    def of(cls, avatar: Avatar) -> "RestingGarment | None":
+        """Return the last garment of an avatar; None where it has none."""
+        if not avatar.garments:
+            return None
+        texels, size = avatar.texels_on(avatar.garments[-1:]), (-1, avatar.atlas_size[1])
+        return cls(
+            avatar.texel_positions[texels].unflatten(0, size), avatar.texel_weights[texels].unflatten(0, size)
+        )
 
     def silhouette(self, transforms: Float[Tensor, "j 4 4"], camera: Camera) -> Bool[Tensor, "h w"]:
         """Return the pixels whose centres it covers, carried by T_world_rest of the joints."""

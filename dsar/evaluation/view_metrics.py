@@ -49,7 +49,7 @@ def evaluate_sequence(
     motion = capture.motions[sequence]
     signal = avatar.driving_signal(motion)
     garment = garment_ground_truth(capture, sequence)
-    resting = RestingGarment(avatar) if avatar.garments else None
+    resting = RestingGarment.of(avatar)
     rows, before = [], None
     for number, gaussians in roll_out(avatar, motion, streams=streams):
         frame = number - START_FRAME

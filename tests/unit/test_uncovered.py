@@ -1,12 +1,10 @@
 """The body that a lifted garment leaves free, on a garment of our own making."""
 
 import math
-from types import SimpleNamespace
 
 import pytest
 import torch
 
-from dsar.avatar.charts import Chart
 from dsar.avatar.garment_chart import PAST_HEM, tube_faces
 from dsar.evaluation.uncovered import FEWEST, RestingGarment, psnr_uncovered, touched_pixels
 from dsar.evaluation.views import View
@@ -31,16 +29,11 @@ def tube(top: float, bottom: float, radius: float = 0.3):
     return torch.stack([x, heights, z], -1).reshape(-1, 3)
 
 
-def avatar_with(points):
-    """As much of an avatar as the measure looks at: a garment's chart and one joint."""
-    chart, count = Chart("garment", "tube", range(ROWS)), len(points)
-    return SimpleNamespace(
-        garments=(chart,),
-        atlas_size=(ROWS, COLUMNS),
-        texels_on=lambda charts: torch.arange(count) if charts == [chart] else None,
-        texel_positions=points,
-        texel_weights=torch.ones(count, 1),
-    )
+def silhouette(camera, top, bottom, transform=None):
+    """Where a tube on a single joint is when it rests, its chart going on past the hem."""
+    positions = tube(top, bottom - PAST_HEM).unflatten(0, (ROWS, COLUMNS))
+    garment = RestingGarment(positions, torch.ones(ROWS, COLUMNS, 1))
+    return garment.silhouette(torch.eye(4)[None] if transform is None else transform[None], camera)
 
 
 def test_a_tube_s_triangles_close_it_and_face_outwards():
@@ -55,41 +48,36 @@ def test_a_tube_s_triangles_close_it_and_face_outwards():
 
 
 def test_only_pixels_that_the_lifted_garment_leaves_free_count(camera):
-    silhouette = RestingGarment(avatar_with(tube(0.4, -0.4 - PAST_HEM))).silhouette(
-        torch.eye(4)[None], camera
-    )
+    resting = silhouette(camera, 0.4, -0.4)
     lifted = touched_pixels(tube(0.4, 0.0), tube_faces(ROWS, COLUMNS), camera)
     mask = torch.zeros(SIZE, SIZE)
     mask[:, 28:36] = 1.0
     truth = View(torch.full((SIZE, SIZE, 3), 0.5), mask)
     wrong = truth.color.clone()
-    free = silhouette & ~lifted & (mask > 0.5)
+    free = resting & ~lifted & (mask > 0.5)
     assert 8 * 8 < int(free.sum()) < 8 * 14
     wrong[~free] = 0.0
-    assert psnr_uncovered(wrong, truth, lifted, silhouette) == pytest.approx(100.0)
+    assert psnr_uncovered(wrong, truth, lifted, resting) == pytest.approx(100.0)
     wrong = truth.color.clone()
     wrong[free] += 0.1
-    assert psnr_uncovered(wrong, truth, lifted, silhouette) == pytest.approx(20.0, abs=1e-3)
+    assert psnr_uncovered(wrong, truth, lifted, resting) == pytest.approx(20.0, abs=1e-3)
 
 
 def test_a_garment_at_rest_leaves_nothing_free(camera):
     faces = tube_faces(ROWS, COLUMNS)
-    silhouette = RestingGarment(avatar_with(tube(0.4, -0.4 - PAST_HEM))).silhouette(
-        torch.eye(4)[None], camera
-    )
+    resting = silhouette(camera, 0.4, -0.4)
     covered = touched_pixels(tube(0.4, -0.4), faces, camera)
     truth = View(torch.rand(SIZE, SIZE, 3), torch.ones(SIZE, SIZE))
-    assert int((silhouette & ~covered).sum()) < FEWEST
-    assert psnr_uncovered(torch.zeros(SIZE, SIZE, 3), truth, covered, silhouette) is None
+    assert int((resting & ~covered).sum()) < FEWEST
+    assert psnr_uncovered(torch.zeros(SIZE, SIZE, 3), truth, covered, resting) is None
 
 
 def test_the_silhouette_moves_with_the_skeleton(camera):
-    garment = RestingGarment(avatar_with(tube(0.4, -0.4)))
-    moved = torch.eye(4)[None].clone()
-    moved[0, 0, 3] = 5 * 1.7 / 60
-    still, shifted = (garment.silhouette(transforms, camera) for transforms in (torch.eye(4)[None], moved))
+    moved = torch.eye(4)
+    moved[0, 3] = 5 * 1.7 / 60
+    still, shifted = (silhouette(camera, 0.4, -0.4, transform) for transform in (torch.eye(4), moved))
     overlap = (still.roll(5, 1) & shifted).sum() / shifted.sum()
-    assert overlap > 0.95
+    assert overlap > 0.9
 
 
 def test_a_pixel_is_touched_by_a_garment_at_any_of_its_samples(camera):
