@@ -12,6 +12,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
@@ -20,6 +21,7 @@ from dsar.avatar.avatar import Avatar
 from dsar.avatar.driving import DrivingSignal
 from dsar.avatar.garment_chart import arm_joints, tube_faces
 from dsar.body.skinning import skin_points
+from dsar.raster.jit import kernel
 from dsar.raster.mesh import MeshView, rasterize_mesh
 from dsar.training import workers
 from dsar.training.registered_maps import RegisteredMaps
@@ -208,11 +210,35 @@ def _closeness(
     known, floor = depth[depth.isfinite()], math.exp(-3)
     if not len(known):
         return mask.float().clamp_min(floor)
-    pixel = float(known.median() / camera.K[0, 0])
-    closeness = mask.float()
-    for _ in range(math.ceil(3 * SHADE / pixel)):
-        closeness = closeness.maximum(math.exp(-pixel / SHADE) * _spread(closeness, 1))
-    return closeness.clamp_min(floor)
+    away = _pixels_away(mask.numpy()) * float(known.median() / camera.K[0, 0])
+    return torch.from_numpy(np.exp(-away / SHADE)).clamp_min(floor)
+
+
+def _pixels_away(mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    """Return each pixel's distance to a mask in steps to neighbours, diagonal ones as long as they are."""
+    away = np.where(mask, 0, sum(mask.shape)).astype(np.float32)
+    _sweep(away)
+    _sweep(away[::-1, ::-1])
+    return away
+
+
+@kernel
+def _sweep(away):
+    """Shorten distances by steps from the left and from the row above."""
+    height, width = away.shape
+    diagonal = np.float32(np.sqrt(2.0))
+    for row in range(height):
+        for column in range(width):
+            best = away[row, column]
+            if column > 0:
+                best = min(best, away[row, column - 1] + np.float32(1))
+            if row > 0:
+                best = min(best, away[row - 1, column] + np.float32(1))
+                if column > 0:
+                    best = min(best, away[row - 1, column - 1] + diagonal)
+                if column + 1 < width:
+                    best = min(best, away[row - 1, column + 1] + diagonal)
+            away[row, column] = best
 
 
 def _reduced(mask: Bool[Tensor, "h w"], target: Target, camera: Camera) -> Bool[Tensor, "h2 w2"]:

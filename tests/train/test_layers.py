@@ -15,7 +15,7 @@ from dsar.geometry.harmonics import color_from_harmonics
 from dsar.network import NetworkOutput
 from dsar.raster.mesh import rasterize_mesh
 from dsar.training.chunk import ChunkTrainer
-from dsar.training.layers import FRAMES, Layers
+from dsar.training.layers import FRAMES, Layers, _pixels_away
 from dsar.training.optimizers import keep_still, set_rates
 from dsar.training.registered_maps import RegisteredMaps
 from dsar.training.schedule import ScheduleState
@@ -217,3 +217,11 @@ def test_frames_are_spread_and_hold_those_with_the_garment_highest(capture, avat
     assert 120 not in frames
     assert max(frames) < 300
     assert max(np.diff(sorted(frames))) < 15
+
+
+def test_distances_to_a_mask_are_those_of_the_shortest_walk():
+    mask = np.random.default_rng(0).random((40, 30)) > 0.99
+    pixels = np.indices(mask.shape).reshape(2, -1, 1)
+    rows, columns = np.abs(pixels - np.stack(np.nonzero(mask))[:, None])
+    walks = np.maximum(rows, columns) + (np.sqrt(2) - 1) * np.minimum(rows, columns)
+    assert np.allclose(_pixels_away(mask), walks.min(1).reshape(mask.shape), atol=1e-4)
