@@ -46,7 +46,7 @@ class Avatar(nn.Module):
     texel_frames: Tensor
     texel_tangents: Tensor
     texel_hidden: Tensor
-    texel_guarded: Tensor
+    texel_beneath: Tensor
     """Texels of the body that a garment covers at times: their looks do not change any more."""
     texel_borrowed: Tensor
     """Those of them that were never seen without one, and have the looks of others."""
@@ -65,7 +65,7 @@ class Avatar(nn.Module):
         self.register_buffer("texel_frames", atlas.frames)
         self.register_buffer("texel_tangents", atlas.tangents)
         self.register_buffer("texel_hidden", atlas.hidden)
-        self.register_buffer("texel_guarded", atlas.hidden.clone())
+        self.register_buffer("texel_beneath", atlas.hidden.clone())
         self.register_buffer("texel_borrowed", atlas.hidden.clone())
         axes = atlas.frames if model.axes == "surface" else torch.eye(3).expand_as(atlas.frames)
         self.register_buffer("texel_axes", axes.contiguous(), persistent=False)
@@ -110,9 +110,9 @@ class Avatar(nn.Module):
 
     @property
     def borrowed_share(self) -> float | None:
-        """Share of the guarded texels that never were seen without a garment; None without any."""
-        guarded = int(self.texel_guarded.sum())
-        return int(self.texel_borrowed.sum()) / guarded if guarded else None
+        """Share of the fixed texels that never were seen without a garment; None without any."""
+        fixed = int(self.texel_beneath.sum())
+        return int(self.texel_borrowed.sum()) / fixed if fixed else None
 
     def texels_on(self, charts: Sequence[Chart]) -> Int64[Tensor, " g"]:
         """Return which Gaussians lie on some of the charts."""
@@ -168,7 +168,7 @@ class Avatar(nn.Module):
         """Show the body beneath garments as the nearest bare texel is; called once the template is fitted.
 
         Fitted along with the garment it would be painted like it, and when the cloth lifts, that paint
-        stays behind. From then on these texels are guarded: nothing but `guard_looks` changes their looks.
+        stays behind. From then on these texels are fixed: nothing but `fix_looks` changes their looks.
         """
         if not self.texel_hidden.any():
             return
@@ -176,31 +176,31 @@ class Avatar(nn.Module):
         self.texel_hidden.fill_(False)
 
     @torch.no_grad()
-    def guard_looks(
-        self, guarded: Bool[Tensor, " n"], colors: Float[Tensor, "n 3"], seen: Bool[Tensor, " n"]
+    def fix_looks(
+        self, fixed: Bool[Tensor, " n"], colors: Float[Tensor, "n 3"], seen: Bool[Tensor, " n"]
     ) -> None:
         """Give body texels that a garment covers at times their looks, which nothing changes any more.
 
         Those that strayed from the body, to fill in for the garment's border, come back.
 
         Args:
-            guarded: These texels, besides those that are guarded already.
+            fixed: These texels, besides those that are fixed already.
             colors: Display-referred sRGB in [0, 1] of those that were `seen` in pixels without a garment. The
                 others take the looks of the nearest texel that was, or that no garment ever covers.
-            seen: Which guarded texels have a colour.
+            seen: Which fixed texels have a colour.
         """
-        self.texel_guarded |= guarded
-        seen = seen & self.texel_guarded
+        self.texel_beneath |= fixed
+        seen = seen & self.texel_beneath
         harmonics = self.template.harmonics
         harmonics[seen] = 0.0
         harmonics[seen, 0] = dc_from_color(colors[seen])
-        sources = torch.cat([seen.nonzero().squeeze(1), self._bare_texels(self.texel_guarded)])
-        self._borrow_looks(self.texel_guarded & ~seen, sources)
+        sources = torch.cat([seen.nonzero().squeeze(1), self._bare_texels(self.texel_beneath)])
+        self._borrow_looks(self.texel_beneath & ~seen, sources)
         strayed = (self.template.means - self.texel_positions).norm(dim=1) > STRAYED
-        self.template.reset_shapes(self.texel_guarded & strayed, self.texel_positions, self.texel_tangents)
+        self.template.reset_shapes(self.texel_beneath & strayed, self.texel_positions, self.texel_tangents)
         logits = self.template.opacity_logits
-        logits[self.texel_guarded] = logits[self.texel_guarded].clamp_min(VISIBLE_LOGIT)
-        self.texel_borrowed.copy_(self.texel_guarded & ~seen)
+        logits[self.texel_beneath] = logits[self.texel_beneath].clamp_min(VISIBLE_LOGIT)
+        self.texel_borrowed.copy_(self.texel_beneath & ~seen)
 
     def _bare_texels(self, beneath: Bool[Tensor, " n"]) -> Int64[Tensor, " m"]:
         """Return the body's texels that are not beneath a garment, far enough from those to be unpainted."""
@@ -257,11 +257,11 @@ class Avatar(nn.Module):
             offset, appearance = output.offset, output.appearance
         sampling = self.control.sampling
         if blended.dtype == torch.float32 and blended.device.type == "cpu":
-            axes, guarded = self.texel_axes, self.texel_guarded
-            return pose_fused(self.template, offset, appearance, sampling, axes, blended, guarded)
+            axes, fixed = self.texel_axes, self.texel_beneath
+            return pose_fused(self.template, offset, appearance, sampling, axes, blended, fixed)
         offsets = (self.texel_axes * sample_bilinear(offset, sampling)[..., None, :]).sum(-1)
         residuals = sample_bilinear(appearance, sampling)
-        return pose_gaussians(self.template.activate(offsets, residuals, self.texel_guarded), blended)
+        return pose_gaussians(self.template.activate(offsets, residuals, self.texel_beneath), blended)
 
     def deformed_control_points(
         self, motion_windows: Float[Tensor, "b t j 4 4"], output: NetworkOutput

@@ -29,7 +29,7 @@ def pose_fused(
     sampling: BilinearSampling,
     axes: Float[Tensor, "n 3 3"],
     blended: Float[Tensor, "b n 3 4"],
-    guarded: Bool[Tensor, " n"],
+    fixed: Bool[Tensor, " n"],
 ) -> list[Gaussians]:
     """Return the posed Gaussians of each batch entry; float32 in main memory only.
 
@@ -40,7 +40,7 @@ def pose_fused(
         sampling: how each texel is sampled from the maps.
         axes: columns are the offset's axes in the canonical frame.
         blended: the linear blend of bone transforms at each texel.
-        guarded: which Gaussians keep their looks, as `GaussianParameters.activate` takes them.
+        fixed: which Gaussians keep their looks, as `GaussianParameters.activate` takes them.
     """
     values = torch.cat([offset, appearance], 1).flatten(2).transpose(1, 2)
     bone_rotations = nearest_quaternions(blended[..., :3])
@@ -48,7 +48,7 @@ def pose_fused(
     for entry, bone_rotation, transform in zip(values, bone_rotations, blended, strict=True):
         means, rotations, scales, opacities, harmonics = _Pose.apply(
             entry, template.means, template.quaternions, template.log_scales, template.opacity_logits,
-            template.harmonics, *sampling, axes, transform, bone_rotation, guarded,
+            template.harmonics, *sampling, axes, transform, bone_rotation, fixed,
         )  # fmt: skip
         if harmonics.shape[1] > 1:
             harmonics = rotate_harmonics(harmonics[None], bone_rotation[None])[0]
@@ -83,7 +83,7 @@ class _Pose(torch.autograd.Function):
 @kernel
 def _pose(
     values, means, quaternions, log_scales, logits, harmonics, cells, weights, axes, transforms, bones,
-    guarded, out_means, out_rotations, out_scales, out_opacities, out_harmonics,
+    fixed, out_means, out_rotations, out_scales, out_opacities, out_harmonics,
 ):  # fmt: skip
     """Sample the residuals of every texel, add them, activate, and pose."""
     n, bands = harmonics.shape[0], harmonics.shape[1]
@@ -94,7 +94,7 @@ def _pose(
         w0, w1, w2, w3 = weights[i, 0], weights[i, 1], weights[i, 2], weights[i, 3]
         for c in range(count):
             r[c] = w0 * values[i0, c] + w1 * values[i1, c] + w2 * values[i2, c] + w3 * values[i3, c]
-        if guarded[i]:
+        if fixed[i]:
             r[3:] = 0
         x = means[i, 0] + axes[i, 0, 0] * r[0] + axes[i, 0, 1] * r[1] + axes[i, 0, 2] * r[2]
         y = means[i, 1] + axes[i, 1, 0] * r[0] + axes[i, 1, 1] * r[1] + axes[i, 1, 2] * r[2]
@@ -124,7 +124,7 @@ def _pose(
 
 @kernel
 def _pose_backward(
-    values, quaternions, cells, weights, axes, transforms, bones, guarded, scales, opacities,
+    values, quaternions, cells, weights, axes, transforms, bones, fixed, scales, opacities,
     v_means, v_rotations, v_scales, v_opacities, v_harmonics,
     out_values, out_means, out_quaternions, out_log_scales, out_logits, out_harmonics,
 ):  # fmt: skip
@@ -143,7 +143,7 @@ def _pose_backward(
         out_means[i, 0], out_means[i, 1], out_means[i, 2] = x, y, z
         for k in range(3):
             r[k] = axes[i, 0, k] * x + axes[i, 1, k] * y + axes[i, 2, k] * z
-        if guarded[i]:
+        if fixed[i]:
             out_means[i], out_quaternions[i], out_log_scales[i], out_harmonics[i] = 0, 0, 0, 0
             out_logits[i] = 0
             for c in range(3):

@@ -55,20 +55,20 @@ class GaussianParameters(nn.Module):
         self,
         offset: Float[Tensor, "b n 3"] | None = None,
         appearance: Float[Tensor, "b n a"] | None = None,
-        guarded: Bool[Tensor, " n"] | None = None,
+        fixed: Bool[Tensor, " n"] | None = None,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """Return canonical means, rotations, scales, opacities and harmonics, batch first.
 
         Without residuals it is the template itself, in a batch of one. Residuals are added to the raw
         values: metres to means, then quaternion 4, log-scale 3, logit 1, harmonics 3k (paper equation 2).
-        Gaussians that are `guarded` move with the offset, but look as they do: no residual of theirs counts,
+        Gaussians that are `fixed` move with the offset, but look as they do: no residual of theirs counts,
         and their parameters get no gradient.
         """
         raw = (self.means, self.quaternions, self.log_scales, self.opacity_logits, self.harmonics)
-        if guarded is not None:
-            raw = tuple(torch.where(_like(guarded, value), value.detach(), value) for value in raw)
+        if fixed is not None:
+            raw = tuple(torch.where(_like(fixed, value), value.detach(), value) for value in raw)
             if appearance is not None:
-                appearance = appearance.masked_fill(guarded[:, None], 0.0)
+                appearance = appearance.masked_fill(fixed[:, None], 0.0)
         means, quaternions, log_scales, logits, harmonics = (value[None] for value in raw)
         if offset is not None and appearance is not None:
             quaternion, log_scale, logit, harmonic = appearance.split([4, 3, 1, appearance.shape[-1] - 8], -1)

@@ -3,8 +3,8 @@
 A texel that a garment covers at times would take the garment's paint wherever the predicted cloth is not
 quite where the true one is, and keep it when the cloth lifts. So it gets its colours once, from pixels of
 the training images that no garment covers, by the registered maps or by the capture's own labels; where it
-never was seen it takes the looks of the nearest texel that was. From then on it is guarded
-(`Avatar.guard_looks`): neither images nor residuals change it.
+never was seen it takes the looks of the nearest texel that was. From then on it is fixed
+(`Avatar.fix_looks`): neither images nor residuals change it.
 """
 
 import logging
@@ -101,12 +101,12 @@ class Layers:
         covered = (found.covered > 0) & self._coverable()
         seen = found.pixels >= FEWEST
         colors = found.colors / found.weights.clamp_min(1e-6)[:, None]
-        avatar.guard_looks(covered, colors, seen)
-        guarded = int(avatar.texel_guarded.sum())
+        avatar.fix_looks(covered, colors, seen)
+        fixed = int(avatar.texel_beneath.sum())
         LOGGER.info(
             "Beneath the garment: %d texels, %.0f %% of them never seen without it: they look as the nearest "
             "that was",
-            *(guarded, 100 * (avatar.borrowed_share or 0.0)),
+            *(fixed, 100 * (avatar.borrowed_share or 0.0)),
         )
 
     def frames(self) -> list[tuple[str, int]]:
@@ -136,7 +136,7 @@ class Layers:
         """Return which texels of the body a garment may cover: those not above it, and no arms."""
         avatar = self.avatar
         heights = avatar.texel_positions[:, 1]
-        body = torch.zeros_like(avatar.texel_guarded)
+        body = torch.zeros_like(avatar.texel_beneath)
         body[avatar.texels_on(avatar.charts[:1])] = True
         arm = avatar.texel_weights[:, arm_joints()].sum(1) >= 0.5
         return body & ~arm & (heights <= heights[self.garment].max())

@@ -59,8 +59,8 @@ def set_rates(optimizers: Mapping[str, torch.optim.Optimizer], schedule_state: S
 
 
 def keep_still(optimizers: Mapping[str, torch.optim.Optimizer], avatar: Avatar) -> None:
-    """Forget the momentum of guarded Gaussians: they get no gradient any more, but would drift on by it."""
+    """Forget the momentum of fixed Gaussians: they get no gradient any more, but would drift on by it."""
     slots = optimizers["adam"].state
     for parameter in avatar.template.parameters():
         if parameter in slots:
-            slots[parameter]["exp_avg"][avatar.texel_guarded] = 0.0
+            slots[parameter]["exp_avg"][avatar.texel_beneath] = 0.0

@@ -104,27 +104,27 @@ def test_what_is_beneath_learns_from_bare_pixels_alone(capture, avatar, signals,
     with torch.no_grad():
         avatar.template.harmonics.copy_(torch.full_like(avatar.template.harmonics, 2.0))
     Layers(painted, avatar, maps, signals, {"sway": range(1)}).settle()
-    guarded, borrowed = avatar.texel_guarded, avatar.texel_borrowed
-    assert guarded[hidden].all()
-    assert not guarded[avatar.garment_texels()].any()
+    fixed, borrowed = avatar.texel_beneath, avatar.texel_borrowed
+    assert fixed[hidden].all()
+    assert not fixed[avatar.garment_texels()].any()
     assert 0 < avatar.borrowed_share < 0.8
-    learnt = colors_of(avatar)[guarded & ~borrowed]
+    learnt = colors_of(avatar)[fixed & ~borrowed]
     assert len(learnt) > 100
     assert torch.allclose(learnt, SKIN.expand_as(learnt), atol=0.01), "a garment's colour came through"
     # What was not seen looks as something that was, or that no garment covers.
-    known = {tuple(c) for c in avatar.template.harmonics[~(guarded & borrowed), 0].tolist()}
+    known = {tuple(c) for c in avatar.template.harmonics[~(fixed & borrowed), 0].tolist()}
     assert {tuple(c) for c in avatar.template.harmonics[borrowed, 0].tolist()} <= known
 
 
-def test_texels_that_only_a_moving_garment_covers_are_guarded_too(capture, avatar, signals):
+def test_texels_that_only_a_moving_garment_covers_are_fixed_too(capture, avatar, signals):
     hidden, maps = avatar.texel_hidden.clone(), lifted_maps(avatar, -0.12)
     painted = paint(capture, garment_in(avatar, signals, maps))
     Layers(painted, avatar, maps, signals, {"sway": range(1)}).settle()
-    extra = avatar.texel_guarded & ~hidden
+    extra = avatar.texel_beneath & ~hidden
     hem = avatar.texel_positions[avatar.garment_texels(), 1].min()
     assert extra.sum() > 30
     assert avatar.texel_positions[extra, 1].min() < hem - 0.05
-    assert not (avatar.texel_guarded & (avatar.texel_positions[:, 0].abs() > 0.35)).any(), "an arm is guarded"
+    assert not (avatar.texel_beneath & (avatar.texel_positions[:, 0].abs() > 0.35)).any(), "an arm is fixed"
 
 
 def test_without_maps_or_labels_the_nearest_skin_beyond_the_border_is_taken(capture, avatar, signals):
@@ -137,7 +137,7 @@ def test_without_maps_or_labels_the_nearest_skin_beyond_the_border_is_taken(capt
     sources = avatar.template.harmonics[hidden, 0, 0].detach().long()
     assert not hidden[sources].any()
     assert torch.cdist(points[sources], points[hidden]).amin() > BORDER
-    assert torch.equal(avatar.texel_guarded, hidden)
+    assert torch.equal(avatar.texel_beneath, hidden)
     assert avatar.borrowed_share == 1
 
 
@@ -151,15 +151,15 @@ def test_a_gaussian_that_strayed_from_the_body_comes_back(avatar):
     shapes = avatar.template.log_scales.detach().clone()
     which = torch.zeros(avatar.num_gaussians, dtype=torch.bool)
     which[[here, there]] = True
-    avatar.guard_looks(which, SKIN.expand(len(which), 3), which)
+    avatar.fix_looks(which, SKIN.expand(len(which), 3), which)
     assert torch.allclose(avatar.template.means[here], avatar.texel_positions[here] + 0.005)
     assert torch.equal(avatar.template.means[there], avatar.texel_positions[there])
     assert torch.allclose(avatar.template.log_scales[there], shapes[there] - 1.0, atol=1e-5)
 
 
-def test_residuals_move_guarded_texels_and_do_not_change_their_looks(capture, avatar, signals):
+def test_residuals_move_fixed_texels_and_do_not_change_their_looks(capture, avatar, signals):
     avatar.unhide_covered_texels()
-    guarded, window = avatar.texel_guarded, signals["sway"].windows[[0]]
+    fixed, window = avatar.texel_beneath, signals["sway"].windows[[0]]
     shape = (1, 3 + avatar.model.appearance_channels, *avatar.control.size)
     values = 0.1 * torch.randn(shape, generator=torch.Generator().manual_seed(0))
     outputs = [NetworkOutput(v[:, :3], v[:, 3:], ()) for v in (torch.zeros(shape), values)]
@@ -170,12 +170,12 @@ def test_residuals_move_guarded_texels_and_do_not_change_their_looks(capture, av
         still, moved = (model.gaussians(window.to(kind), output)[0] for output in typed)
         for name in ("rotations", "scales", "opacities", "harmonics"):
             before, after = getattr(still, name), getattr(moved, name)
-            assert torch.equal(before[guarded], after[guarded]), name
-            assert not torch.allclose(before[~guarded], after[~guarded]), name
-        assert not torch.allclose(still.means[guarded], moved.means[guarded])
+            assert torch.equal(before[fixed], after[fixed]), name
+            assert not torch.allclose(before[~fixed], after[~fixed]), name
+        assert not torch.allclose(still.means[fixed], moved.means[fixed])
 
 
-def test_images_never_reach_guarded_texels_and_momentum_does_not_move_them(capture, avatar, signals):
+def test_images_never_reach_fixed_texels_and_momentum_does_not_move_them(capture, avatar, signals):
     state = TrainingState.begin(TrainConfig(), capture, avatar, {"sway": range(9)}, [("sway", 0)])
     trainer = ChunkTrainer(TrainConfig(), capture, state, signals, None)
     gradients = Gradients([*avatar.parameters(), *state.rest.parameters()])
@@ -189,19 +189,19 @@ def test_images_never_reach_guarded_texels_and_momentum_does_not_move_them(captu
     painted = paint(capture, garment_in(avatar, signals, maps))
     Layers(painted, avatar, maps, signals, {"sway": range(1)}).settle()
     keep_still(state.optimizers, avatar)
-    guarded = avatar.texel_guarded
+    fixed = avatar.texel_beneath
     before = {name: p.detach().clone() for name, p in avatar.template.named_parameters()}
     for seed in range(3):
         set_rates(state.optimizers, LATER)
         gradients.clear()
         trainer.backward_chunk(np.random.default_rng(seed), LATER)
         for name, parameter in avatar.template.named_parameters():
-            assert not parameter.grad[guarded].any(), name
+            assert not parameter.grad[fixed].any(), name
         adam.step()
     for name, parameter in avatar.template.named_parameters():
-        assert torch.equal(parameter[guarded], before[name][guarded]), f"{name} drifted"
-        assert not torch.equal(parameter[~guarded], before[name][~guarded]), f"{name} learns nothing any more"
-    assert (avatar.template.opacity_logits[guarded] >= VISIBLE_LOGIT).all()
+        assert torch.equal(parameter[fixed], before[name][fixed]), f"{name} drifted"
+        assert not torch.equal(parameter[~fixed], before[name][~fixed]), f"{name} learns nothing any more"
+    assert (avatar.template.opacity_logits[fixed] >= VISIBLE_LOGIT).all()
 
 
 def test_frames_are_spread_and_hold_those_with_the_garment_highest(capture, avatar):

@@ -90,6 +90,6 @@ def test_mattes_and_layers_agree_on_what_is_garment_and_what_is_beneath():
     garment = torch.zeros(avatar.num_gaussians, dtype=torch.bool)
     garment[avatar.garment_texels()] = True
     assert torch.equal(indices == names.index(GARMENT), garment)
-    assert not garment[avatar.texel_guarded].any()
-    beneath = {names[index] for index in indices[avatar.texel_guarded].unique().tolist()}
+    assert not garment[avatar.texel_beneath].any()
+    beneath = {names[index] for index in indices[avatar.texel_beneath].unique().tolist()}
     assert {"left_leg", "right_leg"} <= beneath <= {"left_leg", "right_leg", "torso"}
