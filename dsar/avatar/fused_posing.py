@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
@@ -33,6 +33,7 @@ def pose_fused(
     axes: Float[Tensor, "n 3 3"],
     blended: Float[Tensor, "b n 3 4"],
     bone_rotations: Float[Tensor, "b n 4"],
+    fixed: Bool[Tensor, " n"],
 ) -> list[Gaussians]:
     """Return the posed Gaussians of each batch entry; float32 in main memory only.
 
@@ -44,13 +45,14 @@ def pose_fused(
         axes: columns are the offset's axes in the canonical frame.
         blended: the linear blend of bone transforms at each texel.
         bone_rotations: its nearest rotation, unit wxyz.
+        fixed: which Gaussians keep their looks, as `GaussianParameters.activate` takes them.
     """
     # Channels fill whole registers.
     room = offset.new_zeros(len(offset), -(3 + appearance.shape[1]) % LANES, *offset.shape[2:])
     values = torch.cat([offset, appearance, room], 1).flatten(2).transpose(1, 2)
     fields = _Pose.apply(
         values, template.means, template.quaternions, template.log_scales, template.opacity_logits,
-        template.harmonics, *sampling, axes, blended, bone_rotations,
+        template.harmonics, *sampling, axes, fixed, blended, bone_rotations,
     )  # fmt: skip
     posed = []
     for entry, bone_rotation in enumerate(bone_rotations):
@@ -92,12 +94,12 @@ class _Pose(torch.autograd.Function):
                 values[entry], raw[1], *texels, *(array[entry] for array in per_entry),
                 *(gradient.contiguous().numpy() for gradient in arriving), v_values[entry], *v_raw,
             )  # fmt: skip
-        return *map(torch.from_numpy, (v_values, *v_raw)), None, None, None, None, None
+        return *map(torch.from_numpy, (v_values, *v_raw)), None, None, None, None, None, None
 
 
 @kernel
 def _pose(
-    values, means, quaternions, log_scales, logits, harmonics, cells, weights, axes, transforms, bones,
+    values, means, quaternions, log_scales, logits, harmonics, cells, weights, axes, fixed, transforms, bones,
     out_means, out_rotations, out_scales, out_opacities, out_harmonics,
 ):  # fmt: skip
     """Sample the residuals of every texel, add them, activate, and pose."""
@@ -107,6 +109,8 @@ def _pose(
     for i in range(n):
         for c in range(0, count, LANES):
             store(r, np.uint64(c), _sample(flat, cells[i], weights[i], count, c))
+        if fixed[i]:
+            r[3:] = 0
         x = means[i, 0] + axes[i, 0, 0] * r[0] + axes[i, 0, 1] * r[1] + axes[i, 0, 2] * r[2]
         y = means[i, 1] + axes[i, 1, 0] * r[0] + axes[i, 1, 1] * r[1] + axes[i, 1, 2] * r[2]
         z = means[i, 2] + axes[i, 2, 0] * r[0] + axes[i, 2, 1] * r[1] + axes[i, 2, 2] * r[2]
@@ -142,7 +146,7 @@ def _pose(
 
 @kernel
 def _pose_backward(
-    values, quaternions, cells, weights, axes, transforms, bones, scales, opacities,
+    values, quaternions, cells, weights, axes, fixed, transforms, bones, scales, opacities,
     v_means, v_rotations, v_scales, v_opacities, v_harmonics,
     out_values, out_means, out_quaternions, out_log_scales, out_logits, out_harmonics,
 ):  # fmt: skip
@@ -157,38 +161,41 @@ def _pose_backward(
         x = t[0, 0] * gx + t[1, 0] * gy + t[2, 0] * gz
         y = t[0, 1] * gx + t[1, 1] * gy + t[2, 1] * gz
         z = t[0, 2] * gx + t[1, 2] * gy + t[2, 2] * gz
-        out_means[i, 0] += x
-        out_means[i, 1] += y
-        out_means[i, 2] += z
         for k in range(3):
             r[k] = axes[i, 0, k] * x + axes[i, 1, k] * y + axes[i, 2, k] * z
-        bw, bx = quaternions[i, 0] + sampled[3], quaternions[i, 1] + sampled[4]
-        by, bz = quaternions[i, 2] + sampled[5], quaternions[i, 3] + sampled[6]
-        inverse = np.float32(1) / max(np.sqrt(bw * bw + bx * bx + by * by + bz * bz), np.float32(1e-12))
-        bw, bx, by, bz = bw * inverse, bx * inverse, by * inverse, bz * inverse
-        # The gradient is rotated back with the conjugate of the bone's rotation.
-        aw, ax, ay, az = bones[i, 0], -bones[i, 1], -bones[i, 2], -bones[i, 3]
-        pw, px, py, pz = v_rotations[i, 0], v_rotations[i, 1], v_rotations[i, 2], v_rotations[i, 3]
-        qw = aw * pw - ax * px - ay * py - az * pz
-        qx = aw * px + ax * pw + ay * pz - az * py
-        qy = aw * py - ax * pz + ay * pw + az * px
-        qz = aw * pz + ax * py - ay * px + az * pw
-        radial = bw * qw + bx * qx + by * qy + bz * qz
-        r[3], r[4] = (qw - bw * radial) * inverse, (qx - bx * radial) * inverse
-        r[5], r[6] = (qy - by * radial) * inverse, (qz - bz * radial) * inverse
-        for k in range(3):
-            free = _SMALLEST < scales[i, k] < _LARGEST
-            r[7 + k] = v_scales[i, k] * scales[i, k] if free else np.float32(0)
-        r[10] = v_opacities[i] * opacities[i] * (np.float32(1) - opacities[i])
-        for b in range(bands):
+        if fixed[i]:
+            r[3:] = 0
+        else:
+            out_means[i, 0] += x
+            out_means[i, 1] += y
+            out_means[i, 2] += z
+            bw, bx = quaternions[i, 0] + sampled[3], quaternions[i, 1] + sampled[4]
+            by, bz = quaternions[i, 2] + sampled[5], quaternions[i, 3] + sampled[6]
+            inverse = np.float32(1) / max(np.sqrt(bw * bw + bx * bx + by * by + bz * bz), np.float32(1e-12))
+            bw, bx, by, bz = bw * inverse, bx * inverse, by * inverse, bz * inverse
+            # The gradient is rotated back with the conjugate of the bone's rotation.
+            aw, ax, ay, az = bones[i, 0], -bones[i, 1], -bones[i, 2], -bones[i, 3]
+            pw, px, py, pz = v_rotations[i, 0], v_rotations[i, 1], v_rotations[i, 2], v_rotations[i, 3]
+            qw = aw * pw - ax * px - ay * py - az * pz
+            qx = aw * px + ax * pw + ay * pz - az * py
+            qy = aw * py - ax * pz + ay * pw + az * px
+            qz = aw * pz + ax * py - ay * px + az * pw
+            radial = bw * qw + bx * qx + by * qy + bz * qz
+            r[3], r[4] = (qw - bw * radial) * inverse, (qx - bx * radial) * inverse
+            r[5], r[6] = (qy - by * radial) * inverse, (qz - bz * radial) * inverse
             for k in range(3):
-                r[11 + 3 * b + k] = v_harmonics[i, b, k]
-                out_harmonics[i, b, k] += v_harmonics[i, b, k]
-        for k in range(4):
-            out_quaternions[i, k] += r[3 + k]
-        for k in range(3):
-            out_log_scales[i, k] += r[7 + k]
-        out_logits[i] += r[10]
+                free = _SMALLEST < scales[i, k] < _LARGEST
+                r[7 + k] = v_scales[i, k] * scales[i, k] if free else np.float32(0)
+            r[10] = v_opacities[i] * opacities[i] * (np.float32(1) - opacities[i])
+            for b in range(bands):
+                for k in range(3):
+                    r[11 + 3 * b + k] = v_harmonics[i, b, k]
+                    out_harmonics[i, b, k] += v_harmonics[i, b, k]
+            for k in range(4):
+                out_quaternions[i, k] += r[3 + k]
+            for k in range(3):
+                out_log_scales[i, k] += r[7 + k]
+            out_logits[i] += r[10]
         for c in range(0, count, LANES):
             gradient = load(r, np.uint64(c))
             for k in range(4):
