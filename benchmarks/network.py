@@ -120,11 +120,11 @@ def build(case: Case, design: str, device: str) -> Subject:
     def step() -> NetworkOutput:
         return rollout.step(maps, magnitude)
 
-    motion_window, camera = signal.windows[[70]], make_camera(*case.image)
+    motion_window, cloth, camera = signal.windows[[70]], signal.cloth_at([70]), make_camera(*case.image)
 
     @torch.no_grad()
     def frame() -> RenderOutput:
-        output = rollout.step(*avatar.standardize(avatar.input_maps(motion_window, avatar.fps)))
+        output = rollout.step(*avatar.standardize(avatar.input_maps(motion_window, avatar.fps, cloth)))
         return rasterize(avatar.gaussians(motion_window, output)[0], camera)
 
     # The first frame fills the window.

@@ -1,5 +1,6 @@
 """The avatar: template, network and skeleton; one step of it makes one frame of posed Gaussians."""
 
+import dataclasses
 from collections.abc import Collection, Sequence
 
 import torch
@@ -15,10 +16,12 @@ from dsar.avatar.garment_chart import fit_garment_chart, texels_beneath
 from dsar.avatar.guards import LIMITS, Guard
 from dsar.avatar.input_maps import InputMaps, make_input_maps
 from dsar.avatar.input_statistics import InputStatistics
+from dsar.avatar.motion_prior import MotionPrior
 from dsar.avatar.posing import pose_gaussians
 from dsar.avatar.principal_poses import PrincipalPoses
 from dsar.avatar.rest_frames import find_rest_frames
 from dsar.avatar.template import VISIBLE_LOGIT, GaussianParameters
+from dsar.avatar.texel_skin import TexelSkin
 from dsar.body.model import PARENTS
 from dsar.body.skinning import blend_transforms
 from dsar.config import AtlasConfig, ModelConfig
@@ -55,6 +58,8 @@ class Avatar(nn.Module):
 
     def __init__(self, body: Body, atlas: Atlas, model: ModelConfig, fps: float) -> None:
         super().__init__()
+        if len(atlas.charts) == 1:
+            model = dataclasses.replace(model, prior="none")
         self.model, self.fps = model, fps
         for name in ("vertices", "faces", "joints", "weights", "uv", "uv_faces"):
             self.register_buffer(f"body_{name}", getattr(body, name))
@@ -69,7 +74,11 @@ class Avatar(nn.Module):
         self.register_buffer("texel_borrowed", atlas.hidden.clone())
         axes = atlas.frames if model.axes == "surface" else torch.eye(3).expand_as(atlas.frames)
         self.register_buffer("texel_axes", axes.contiguous(), persistent=False)
+        self.texel_skin = TexelSkin.of_weights(atlas.weights)
         self.control = ControlGrid(atlas, model.upsample, surface_axes=model.axes == "surface")
+        self.prior: MotionPrior | None = None
+        if model.prior == "cloth":
+            self.prior = MotionPrior(atlas.charts[1:], self.control, model.upsample, atlas.width)
         self.statistics = InputStatistics(model.map_channels)
         self.principal_poses = PrincipalPoses(model.pose_components, len(self.control.cells), LIMITS.pose)
         self.template = GaussianParameters(atlas.positions, atlas.tangents, atlas.hidden, model.sh_degree)
@@ -83,7 +92,7 @@ class Avatar(nn.Module):
             for name in capture.splits["train"]
         }
         avatar = cls(body, _fit_atlas(capture, body, atlas, signals), model, next(iter(signals.values())).fps)
-        avatar.fit_input_statistics(list(signals.values()))
+        avatar.fit_input_statistics([avatar.with_cloth(signal) for signal in signals.values()])
         return avatar
 
     @property
@@ -129,18 +138,38 @@ class Avatar(nn.Module):
 
     def driving_signal(self, motion: Motion) -> DrivingSignal:
         """Return what drives the avatar through a motion."""
-        return DrivingSignal.of_motion(self.body, motion, self.model.mean_time_constants)
+        return self.with_cloth(DrivingSignal.of_motion(self.body, motion, self.model.mean_time_constants))
+
+    def with_cloth(self, signal: DrivingSignal) -> DrivingSignal:
+        """Return a driving signal with what the motion prior makes of it now, if there is one."""
+        if self.prior is None:
+            return signal
+        cloth = self.prior.simulate(self.body, signal.steady, signal.fps)
+        return dataclasses.replace(signal, cloth=cloth)
+
+    @torch.no_grad()
+    def place_prior(self) -> None:
+        """Give the motion prior the garments' rest shapes; called once the template is fitted."""
+        if self.prior is not None:
+            for chart, garment in zip(self.garments, self.prior.garments, strict=True):
+                texels = self.texels_on([chart])
+                garment.place(self.template.means[texels], self.texel_weights[texels])
 
     def initial_state(self, batch: int = 1) -> NetworkState:
         """Return the state of rollouts that have seen nothing yet."""
         return self.network.initial_state(batch)
 
-    def input_maps(self, motion_windows: Float[Tensor, "b t j 4 4"], fps: float) -> InputMaps:
-        """Return the network's input maps, in metres.
+    def input_maps(
+        self,
+        motion_windows: Float[Tensor, "b t j 4 4"],
+        fps: float,
+        cloth: Float[Tensor, "b g 6"] | None = None,
+    ) -> InputMaps:
+        """Return the network's input maps, in metres; `cloth` is the motion prior of avatars that have one.
 
         Outside training, poses are brought into the range of the training poses, if the model says so.
         """
-        inputs = make_input_maps(self.control, motion_windows, self.body_joints[0], fps, self.model)
+        inputs = make_input_maps(self.control, motion_windows, self.body_joints[0], fps, self.model, cloth)
         maps, limited = self.principal_poses(inputs.maps, self.control.cells)
         return InputMaps(maps, inputs.magnitude, {**inputs.guard_counts, Guard.POSE: limited})
 
@@ -150,8 +179,9 @@ class Avatar(nn.Module):
         maps, magnitudes = [], []
         for signal in signals:
             for frames in torch.arange(0, len(signal), 4).split(16):
-                windows = signal.windows[frames]
-                inputs = make_input_maps(self.control, windows, self.body_joints[0], self.fps, self.model)
+                windows, cloth = signal.windows[frames], signal.cloth_at(frames.tolist())
+                pelvis = self.body_joints[0]
+                inputs = make_input_maps(self.control, windows, pelvis, self.fps, self.model, cloth)
                 maps.append(inputs.maps.flatten(2)[:, :, self.control.cells])
                 magnitudes.append(inputs.magnitude.flatten(2)[:, :, self.control.cells])
         values = torch.cat(maps)
@@ -237,28 +267,43 @@ class Avatar(nn.Module):
         self,
         motion_windows: Float[Tensor, "b t j 4 4"],
         state: NetworkState,
+        cloth: Float[Tensor, "b g 6"] | None = None,
         *,
         streams: Collection[Stream] = STREAMS,
     ) -> tuple[NetworkOutput, NetworkState, InputMaps]:
-        """Run the network one frame on; return its output, the next state and the maps it saw."""
-        inputs = self.input_maps(motion_windows, self.fps)
+        """Run the network one frame on; return the output, the next state and the maps it saw."""
+        inputs = self.input_maps(motion_windows, self.fps, cloth)
         output, state = self.network(*self.standardize(inputs), state, streams=streams)
-        return output, state, inputs
+        return self.add_prior(output, cloth), state, inputs
+
+    def add_prior(self, output: NetworkOutput, cloth: Float[Tensor, "b g 6"] | None) -> NetworkOutput:
+        """Return the network's output on top of the motion prior, which is the base of the offset."""
+        if cloth is None:
+            return output
+        return dataclasses.replace(output, offset=output.offset + self.offset_base(cloth))
+
+    def offset_base(self, cloth: Float[Tensor, "b g 6"]) -> Float[Tensor, "b 3 h w"]:
+        """Return the offset maps, metres, that the network's are added to; the avatar has a motion prior."""
+        if self.prior is None:
+            raise ValueError("the avatar has no motion prior")
+        return self.control.scatter(self.scatter_garment_points(self.prior.base(cloth)))
 
     def gaussians(
         self, motion_windows: Float[Tensor, "b t j 4 4"], output: NetworkOutput | None
     ) -> list[Gaussians]:
         """Return the posed Gaussians of each batch entry; without an output, the template's."""
-        blended = blend_transforms(self.texel_weights, motion_windows[:, :1])[:, 0]
+        transforms = motion_windows[:, 0]
         if output is None:
             shape = (len(motion_windows), 3 + self.model.appearance_channels, *self.control.size)
-            offset, appearance = blended.new_zeros(shape).split([3, shape[1] - 3], 1)
+            offset, appearance = transforms.new_zeros(shape).split([3, shape[1] - 3], 1)
         else:
             offset, appearance = output.offset, output.appearance
         sampling = self.control.sampling
-        if blended.dtype == torch.float32 and blended.device.type == "cpu":
+        if transforms.dtype == torch.float32 and transforms.device.type == "cpu":
+            bones = self.texel_skin.blend(transforms)
             axes, fixed = self.texel_axes, self.texel_beneath
-            return pose_fused(self.template, offset, appearance, sampling, axes, blended, fixed)
+            return pose_fused(self.template, offset, appearance, sampling, axes, *bones, fixed)
+        blended = blend_transforms(self.texel_weights, transforms)
         offsets = (self.texel_axes * sample_bilinear(offset, sampling)[..., None, :]).sum(-1)
         residuals = sample_bilinear(appearance, sampling)
         return pose_gaussians(self.template.activate(offsets, residuals, self.texel_beneath), blended)
@@ -267,9 +312,15 @@ class Avatar(nn.Module):
         self, motion_windows: Float[Tensor, "b t j 4 4"], output: NetworkOutput
     ) -> Float[Tensor, "b p 3"]:
         """Return the newest frame's control points, offset and posed, world metres."""
+        blended = blend_transforms(self.control.weights, motion_windows[:, :1])[:, 0]
+        return self.pose_control_points(blended, output)
+
+    def pose_control_points(
+        self, blended: Float[Tensor, "b p 3 4"], output: NetworkOutput
+    ) -> Float[Tensor, "b p 3"]:
+        """Return the control points, offset and posed by each one's blend of transforms, world metres."""
         offsets = self.gather_control_points(output.offset)
         points = self.control.points + (self.control.axes * offsets[..., None, :]).sum(-1)
-        blended = blend_transforms(self.control.weights, motion_windows[:, :1])[:, 0]
         return (blended[..., :3] * points[..., None, :]).sum(-1) + blended[..., 3]
 
 

@@ -40,6 +40,10 @@ class DrivingSignal:
     """The motion window of every frame."""
     jumps: tuple[int, ...]
     """Frames in which the body is where it cannot have come from the frame before."""
+    steady: Float[Tensor, "f j 4 4"]
+    """The transforms without what jumps have done to the body's place on the ground and its heading."""
+    cloth: Float[Tensor, "f g 6"] | None = None
+    """Where the avatar's motion prior has its garments, if it has one (see `dsar.avatar.motion_prior`)."""
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -87,13 +91,17 @@ class DrivingSignal:
             name: The motion's.
         """
         jumps = find_jumps(transforms, pelvis, fps)
-        if jumps:
-            jumped = _accumulated_jumps(transforms, pelvis, jumps)
-            windows = _windows(jumped.inverse()[:, None] @ transforms, pelvis, fps, time_constants)
-            windows = jumped[:, None, None] @ windows
-        else:
+        if not jumps:
             windows = _windows(transforms, pelvis, fps, time_constants)
-        return cls(name, fps, transforms, windows, tuple(jumps))
+            return cls(name, fps, transforms, windows, (), transforms)
+        jumped = _accumulated_jumps(transforms, pelvis, jumps)
+        steady = jumped.inverse()[:, None] @ transforms
+        windows = jumped[:, None, None] @ _windows(steady, pelvis, fps, time_constants)
+        return cls(name, fps, transforms, windows, tuple(jumps), steady)
+
+    def cloth_at(self, frames: Sequence[int]) -> Float[Tensor, "b g 6"] | None:
+        """Return the motion prior in some frames."""
+        return None if self.cloth is None else self.cloth[list(frames)]
 
 
 def find_jumps(transforms: Float[Tensor, "f j 4 4"], pelvis: Float[Tensor, "3"], fps: float) -> list[int]:

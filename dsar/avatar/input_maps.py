@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor
+from torch import Tensor, nn
 
 from dsar.avatar.control_grid import ControlGrid
 from dsar.avatar.guards import LIMITS, Guard, GuardCounts
@@ -34,6 +34,7 @@ def make_input_maps(
     pelvis: Float[Tensor, "3"],
     fps: float,
     model: ModelConfig,
+    cloth: Float[Tensor, "b g 6"] | None = None,
 ) -> InputMaps:
     """Return the input maps p, dp and the motion magnitudes V = |dp| of a batch of frames (paper equation 6).
 
@@ -45,7 +46,9 @@ def make_input_maps(
       control points' axes, cut at `Limits.speed`; its length, whatever the model has, is V;
     - acceleration, if the model has it: change of the cut velocity, along the same axes;
     - for each running mean of the motion window the lag: the way from the control point to where that mean
-      puts it, along the same axes, cut at `Limits.lag`.
+      puts it, along the same axes, cut at `Limits.lag`;
+    - the motion prior, if the model has one: offset and its change at the garments' control points, along the
+      axes of the network's offsets, zero elsewhere.
 
     Args:
         control: Control points.
@@ -53,6 +56,7 @@ def make_input_maps(
         pelvis: Its position at rest, metres.
         fps: Frames per second of the motion.
         model: Which maps there are, and along which axes.
+        cloth: The motion prior; the garments' control points are the last.
     """
     rows = motion_windows[..., :3, :].transpose(-3, -2).flatten(-2)
     points = (rows @ control.basis.mT).mT
@@ -75,6 +79,10 @@ def make_input_maps(
     if model.acceleration:
         channels.append(_along(axes, (velocity - velocity_before) * rate))
     channels += _along(axes[:, None], lags).unbind(1)
+    if model.prior == "cloth":
+        if cloth is None:
+            raise ValueError("the model has a motion prior, and the frames come without it")
+        channels.append(nn.functional.pad(cloth, (0, 0, len(control.cells) - cloth.shape[1], 0)))
     values = torch.cat([*channels, velocity.norm(dim=-1, keepdim=True)], -1)
     grid = values.new_zeros(len(values), values.shape[-1], control.size[0] * control.size[1])
     grid[:, :, control.cells] = values.transpose(1, 2)

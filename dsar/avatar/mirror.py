@@ -28,12 +28,17 @@ class Mirror:
     """The mirror images of an avatar's outputs."""
 
     def __init__(self, control: ControlGrid) -> None:
-        """Pair each control point with the one nearest to its mirror image."""
+        """Pair each control point with the one of its chart nearest to its mirror image."""
         points, axes, cells = control.points, control.axes, control.cells
         flip = _FLIP.to(points)
-        nearest = [torch.cdist(chunk, points).argmin(1) for chunk in (points * flip).split(1024)]
-        counterpart = torch.cat(nearest)
-        self._cells, self._counterpart_cells = cells, cells[counterpart]
+        counterpart = torch.empty(len(points), dtype=torch.int64)
+        for chart in control.charts:
+            own = control.on_charts([chart])
+            nearest = [
+                torch.cdist(chunk, points[own]).argmin(1) for chunk in (points[own] * flip).split(1024)
+            ]
+            counterpart[own] = own[torch.cat(nearest)] if len(own) else own
+        self._cells, self._counterpart, self._counterpart_cells = cells, counterpart, cells[counterpart]
         self._change_of_axes = axes.mT @ (flip[:, None] * axes[counterpart])
 
     def mirror_offset(self, offset: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
@@ -41,6 +46,16 @@ class Mirror:
         flat = offset.flatten(2)
         moved = self._change_of_axes @ flat[:, :, self._counterpart_cells].transpose(1, 2)[..., None]
         return flat.index_copy(2, self._cells, moved[..., 0].transpose(1, 2)).view_as(offset)
+
+    def mirror_cloth(
+        self, cloth: Float[Tensor, "b g 6"], which: Bool[Tensor, " b"]
+    ) -> Float[Tensor, "b g 6"]:
+        """Return the motion prior with the rollouts in `which` mirrored; the last control points are its."""
+        points = cloth.shape[1]
+        counterparts = self._counterpart[-points:] - (len(self._counterpart) - points)
+        values = cloth[:, counterparts].unflatten(-1, (2, 3))
+        mirrored = (self._change_of_axes[-points:, None] @ values[..., None])[..., 0].flatten(-2)
+        return torch.where(which[:, None, None], mirrored, cloth)
 
     def unmirror(self, output: NetworkOutput, which: Bool[Tensor, " b"]) -> NetworkOutput:
         """Turn the outputs of the rollouts in `which`, made from mirrored motions, into those of the motions.

@@ -118,8 +118,9 @@ class Player:
         if number % self._distance == 0 and number not in self._snapshots:
             self._keep_snapshot(number)
         motion_window = self.signal.windows[[number]]
-        inputs = avatar.input_maps(motion_window, avatar.fps)
-        output = self._session.step(*avatar.standardize(inputs))
+        cloth = self.signal.cloth_at([number])
+        inputs = avatar.input_maps(motion_window, avatar.fps, cloth)
+        output = avatar.add_prior(self._session.step(*avatar.standardize(inputs)), cloth)
         near = LIMITS.offset * avatar.model.offset_limit
         counts = {
             **inputs.guard_counts,

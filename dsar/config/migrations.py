@@ -25,23 +25,30 @@ RENAMED = {
     "schedule.clip": "schedule.max_gradient_norm",
 }
 """Old and new name of each setting, with its section."""
+ADDED = {"model.prior": "none", "loss.residual": 0.0}
+"""Settings that came later, and the value by which runs from before go on as they were."""
 RENAMED_STAGES = {"imitation": "pretraining"}
 """Old and new name of each stage of training, as metrics.jsonl says it."""
 
 
 def rename_settings(values: Any) -> Any:
-    """Return the content of a config.json with the names that settings have now.
+    """Return the content of a config.json with the names that settings have now, and those that came later.
 
     Whatever else it holds stays, for the reader to judge. Where a setting stands by both names, so do both.
     """
     if not isinstance(values, dict):
         return values
     return {
-        section: {_new_name(section, name, part): value for name, value in part.items()}
+        section: _added(section) | {_new_name(section, name, part): value for name, value in part.items()}
         if isinstance(part, dict)
         else part
         for section, part in values.items()
     }
+
+
+def _added(section: str) -> dict[str, Any]:
+    named = {tuple(setting.split(".")): value for setting, value in ADDED.items()}
+    return {name: value for (part, name), value in named.items() if part == section}
 
 
 def _new_name(section: str, name: str, present: dict[str, Any]) -> str:

@@ -58,6 +58,9 @@ class ModelConfig:
     mean_time_constants: tuple[float, ...] = (0.1, 0.2, 0.4)
     """Time constants, seconds, of running means of the motion; for each, the displacement from the newest
     position to the mean is an input map (extension): a memory that nothing has to learn."""
+    prior: Literal["cloth", "none"] = "cloth"
+    """`cloth`: a coarse simulation of each loose garment, driven by the same motion, is an input map and the
+    base of the offset (extension); `none`: the paper's. Without a loose garment there is none."""
     pose_components: int = 0
     """New poses are projected onto so many principal components of the training poses, and kept within two
     standard deviations of each (Li et al. 2024); 0: they are taken as they are."""
@@ -91,7 +94,8 @@ class ModelConfig:
     @property
     def map_channels(self) -> int:
         """Channels of a frame's input maps without the offsets that are fed back."""
-        return 3 + 3 * self.velocity + 3 * self.acceleration + 3 * len(self.mean_time_constants)
+        motion = 3 + 3 * self.velocity + 3 * self.acceleration + 3 * len(self.mean_time_constants)
+        return motion + 6 * (self.prior == "cloth")
 
     @property
     def appearance_channels(self) -> int:
@@ -120,6 +124,9 @@ class LossConfig:
     """The same of the template's own shape: how far neighbouring texels part from the garment's chart."""
     registered: float = 0.04
     """Distance in cm to the registered maps while images are compared (extension)."""
+    residual: float = 0.15
+    """Squared way, in cm, of the garments from their motion prior, beside each cm from the registered maps
+    (extension): what a few training motions would have the network add fits no others."""
     feature: float = 0.01
     """L_feat, with the paper's gamma 0.1 at every level."""
     prediction: float = 0.1
@@ -146,13 +153,14 @@ class ScheduleConfig:
     steps: int = 1500
     """Updates in all."""
     minutes: float | None = None
-    """Wall-clock budget, counted from the end of the first update (which compiles kernels on a new machine):
-    the schedule is compressed to fit when the machine is too slow for `steps`."""
+    """Limit on the time of training, counted from the end of the first update (which compiles kernels on a
+    new machine). A machine that is fast enough does the same `steps` as without it; where it is too slow the
+    schedule is compressed to fit, and the run says that it was cut short."""
     template_fraction: float = 0.12
     """Fraction of the updates that fit the template alone, on near-rest frames."""
     pretraining_fraction: float = 0.2
     """Fraction of the updates that train the network on registered maps, without images; 0: no registration
-    (the paper's). Registration itself takes no updates, but its time is part of the budget."""
+    (the paper's). Registration itself takes no updates, but its time counts."""
     pose_only_fraction: float = 0.0
     """Fraction that trains the network without feedback and memory (the paper's stage 1)."""
     half_resolution_fraction: float = 0.85

@@ -86,23 +86,30 @@ def count_stage_flops(network: DualStreamNetwork, step: Callable[[], object]) ->
 def time_rollout(avatar: Avatar, capture: Capture, sequence: str, frames: int = 100) -> FrameTimes:
     """Return the milliseconds of the network's parts, posing and rasterisation of one camera.
 
-    The first frames are left out. Posing includes the input maps, which are posed control points.
+    The first frames are left out. Posing includes the input maps, which are posed control points. A motion
+    prior is simulated for all frames at once; each is charged its share.
     """
     signal = avatar.driving_signal(capture.motions[sequence])
+    prior_start = read_clock()
+    avatar.with_cloth(signal)
+    prior = 1e3 * (read_clock() - prior_start) / len(signal)
     session = InferenceSession(avatar.network)
     times: dict[str, list[float]] = defaultdict(list)
     for frame in range(_WARM_UP + frames):
         start = read_clock()
         motion_window = signal.windows[[frame % len(signal)]]
-        maps, magnitude = avatar.standardize(avatar.input_maps(motion_window, avatar.fps))
+        cloth = signal.cloth_at([frame % len(signal)])
+        maps, magnitude = avatar.standardize(avatar.input_maps(motion_window, avatar.fps, cloth))
         network_start = read_clock()
         step = partial(session.step, maps, magnitude)
         output, stages = time_stages(session.network, step)
         network_end = read_clock()
+        output = avatar.add_prior(output, cloth)
         gaussians = avatar.gaussians(motion_window, output)[0]
         posed = read_clock()
         render_white(gaussians, capture.cameras[0])
         posing = network_start - start + posed - network_end
+        stages |= {"prior": prior} if avatar.prior is not None else {}
         stages |= {"pose": 1e3 * posing, "raster": 1e3 * (read_clock() - posed)}
         for name, milliseconds in stages.items():
             times[name].append(milliseconds)

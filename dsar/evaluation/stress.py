@@ -131,7 +131,8 @@ def run_twin(avatar: Avatar, motion: Motion, start: int = 30) -> CaseVerdict:
             memory.copy_(torch.randn(memory.shape, generator=generator) * memory.square().mean().sqrt())
             offsets.add_(_NOISE * torch.randn(offsets.shape, generator=generator))
         motion_window = signal.windows[[frame]]
-        output, state, _ = avatar.forward_frame(motion_window.expand(2, -1, -1, -1, -1), state)
+        cloth = signal.cloth_at([frame, frame])
+        output, state, _ = avatar.forward_frame(motion_window.expand(2, -1, -1, -1, -1), state, cloth)
         if frame >= start:
             apart.append(_distance(*_at_control_points(avatar, output)))
     distances = torch.stack(apart)

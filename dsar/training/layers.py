@@ -24,9 +24,10 @@ from dsar.body.skinning import skin_points
 from dsar.raster.jit import kernel
 from dsar.raster.mesh import MeshView, rasterize_mesh
 from dsar.training import workers
+from dsar.training.kept_views import KeptViews
 from dsar.training.registered_maps import RegisteredMaps
 from dsar.training.targets import Target, load_target
-from dsar.types import Camera, Capture
+from dsar.types import Camera
 
 LOGGER = logging.getLogger(__name__)
 
@@ -62,7 +63,7 @@ class Layers:
 
     def __init__(
         self,
-        capture: Capture,
+        views: KeptViews,
         avatar: Avatar,
         maps: RegisteredMaps,
         signals: Mapping[str, DrivingSignal],
@@ -71,13 +72,14 @@ class Layers:
         """Prepare to look at training frames.
 
         Args:
-            capture: Its images, and its labels where it has them.
+            views: Its images, and the capture's labels where it has them.
             avatar: Whose body is looked at; its template is fitted.
             maps: Where the garment is in frames that have one.
             signals: Driving signals of the sequences.
             clips: Frames of each training sequence.
         """
-        self.capture, self.avatar, self.maps = capture, avatar, maps
+        self.views, self.capture = views, views.capture
+        self.avatar, self.maps = avatar, maps
         self.signals, self.clips = signals, clips
         self.garment = avatar.garment_texels()
         rows = sum(len(chart.rows) for chart in avatar.garments)
@@ -149,7 +151,7 @@ class Layers:
         tube = self._tube(sequence, frame)
         for index in self.capture.cameras_with_image(sequence, frame):
             reduction = max(1, self.capture.cameras[index].width // WIDTH)
-            target = load_target(self.capture, sequence, frame, index, reduction)
+            target = load_target(self.views, sequence, frame, index, reduction)
             body = rasterize_mesh(vertices, self.body.faces, target.camera)
             labels = self.capture.garment_mask(sequence, frame, index)
             if labels is not None:

@@ -15,6 +15,7 @@ from dsar.geometry.harmonics import color_from_harmonics
 from dsar.network import NetworkOutput
 from dsar.raster.mesh import rasterize_mesh
 from dsar.training.chunk import ChunkTrainer
+from dsar.training.kept_views import KeptViews
 from dsar.training.layers import FRAMES, Layers, _pixels_away
 from dsar.training.optimizers import keep_still, set_rates
 from dsar.training.registered_maps import RegisteredMaps
@@ -103,7 +104,7 @@ def test_what_is_beneath_learns_from_bare_pixels_alone(capture, avatar, signals,
         maps = RegisteredMaps({}, len(avatar.control.cells), {})
     with torch.no_grad():
         avatar.template.harmonics.copy_(torch.full_like(avatar.template.harmonics, 2.0))
-    Layers(painted, avatar, maps, signals, {"sway": range(1)}).settle()
+    Layers(KeptViews(painted), avatar, maps, signals, {"sway": range(1)}).settle()
     fixed, borrowed = avatar.texel_beneath, avatar.texel_borrowed
     assert fixed[hidden].all()
     assert not fixed[avatar.garment_texels()].any()
@@ -119,7 +120,7 @@ def test_what_is_beneath_learns_from_bare_pixels_alone(capture, avatar, signals,
 def test_texels_that_only_a_moving_garment_covers_are_fixed_too(capture, avatar, signals):
     hidden, maps = avatar.texel_hidden.clone(), lifted_maps(avatar, -0.12)
     painted = paint(capture, garment_in(avatar, signals, maps))
-    Layers(painted, avatar, maps, signals, {"sway": range(1)}).settle()
+    Layers(KeptViews(painted), avatar, maps, signals, {"sway": range(1)}).settle()
     extra = avatar.texel_beneath & ~hidden
     hem = avatar.texel_positions[avatar.garment_texels(), 1].min()
     assert extra.sum() > 30
@@ -133,7 +134,7 @@ def test_without_maps_or_labels_the_nearest_skin_beyond_the_border_is_taken(capt
     with torch.no_grad():
         avatar.template.harmonics[:, 0] = torch.arange(count)[:, None].float()
     maps = RegisteredMaps({}, len(avatar.control.cells), {})
-    Layers(capture, avatar, maps, signals, {"sway": range(1)}).settle()
+    Layers(KeptViews(capture), avatar, maps, signals, {"sway": range(1)}).settle()
     sources = avatar.template.harmonics[hidden, 0, 0].detach().long()
     assert not hidden[sources].any()
     assert torch.cdist(points[sources], points[hidden]).amin() > BORDER
@@ -187,7 +188,7 @@ def test_images_never_reach_fixed_texels_and_momentum_does_not_move_them(capture
         adam.step()
     maps = lifted_maps(avatar, -0.12)
     painted = paint(capture, garment_in(avatar, signals, maps))
-    Layers(painted, avatar, maps, signals, {"sway": range(1)}).settle()
+    Layers(KeptViews(painted), avatar, maps, signals, {"sway": range(1)}).settle()
     keep_still(state.optimizers, avatar)
     fixed = avatar.texel_beneath
     before = {name: p.detach().clone() for name, p in avatar.template.named_parameters()}
@@ -210,7 +211,7 @@ def test_frames_are_spread_and_hold_those_with_the_garment_highest(capture, avat
     maps.fitted["sway"] += 300
     points = avatar.garment_control_points()
     maps.offsets["sway"][205:207, points] = avatar.control.axes[points, 1] * 0.3
-    layers = Layers(capture, avatar, maps, {}, clips)
+    layers = Layers(KeptViews(capture), avatar, maps, {}, clips)
     frames = [frame for _, frame in layers.frames()]
     assert len(frames) == len(set(frames)) <= FRAMES
     assert {205, 206} & set(frames)
