@@ -21,6 +21,7 @@ from dsar.avatar.posing import pose_gaussians
 from dsar.avatar.principal_poses import PrincipalPoses
 from dsar.avatar.rest_frames import find_rest_frames
 from dsar.avatar.template import VISIBLE_LOGIT, GaussianParameters
+from dsar.avatar.texel_skin import TexelSkin
 from dsar.body.model import PARENTS
 from dsar.body.skinning import blend_transforms
 from dsar.config import AtlasConfig, ModelConfig
@@ -62,6 +63,7 @@ class Avatar(nn.Module):
         self.register_buffer("texel_hidden", atlas.hidden)
         axes = atlas.frames if model.axes == "surface" else torch.eye(3).expand_as(atlas.frames)
         self.register_buffer("texel_axes", axes.contiguous(), persistent=False)
+        self.texel_skin = TexelSkin.of_weights(atlas.weights)
         self.control = ControlGrid(atlas, model.upsample, surface_axes=model.axes == "surface")
         self.prior: MotionPrior | None = None
         if model.prior == "cloth":
@@ -221,24 +223,31 @@ class Avatar(nn.Module):
 
     def add_prior(self, output: NetworkOutput, cloth: Float[Tensor, "b g 6"] | None) -> NetworkOutput:
         """Return the network's output on top of the motion prior, which is the base of the offset."""
-        if self.prior is None or cloth is None:
+        if cloth is None:
             return output
-        base = self.control.scatter(self.scatter_garment_points(self.prior.base(cloth)))
-        return dataclasses.replace(output, offset=output.offset + base)
+        return dataclasses.replace(output, offset=output.offset + self.offset_base(cloth))
+
+    def offset_base(self, cloth: Float[Tensor, "b g 6"]) -> Float[Tensor, "b 3 h w"]:
+        """Return the offset maps, metres, that the network's are added to; the avatar has a motion prior."""
+        if self.prior is None:
+            raise ValueError("the avatar has no motion prior")
+        return self.control.scatter(self.scatter_garment_points(self.prior.base(cloth)))
 
     def gaussians(
         self, motion_windows: Float[Tensor, "b t j 4 4"], output: NetworkOutput | None
     ) -> list[Gaussians]:
         """Return the posed Gaussians of each batch entry; without an output, the template's."""
-        blended = blend_transforms(self.texel_weights, motion_windows[:, :1])[:, 0]
+        transforms = motion_windows[:, 0]
         if output is None:
             shape = (len(motion_windows), 3 + self.model.appearance_channels, *self.control.size)
-            offset, appearance = blended.new_zeros(shape).split([3, shape[1] - 3], 1)
+            offset, appearance = transforms.new_zeros(shape).split([3, shape[1] - 3], 1)
         else:
             offset, appearance = output.offset, output.appearance
         sampling = self.control.sampling
-        if blended.dtype == torch.float32 and blended.device.type == "cpu":
-            return pose_fused(self.template, offset, appearance, sampling, self.texel_axes, blended)
+        if transforms.dtype == torch.float32 and transforms.device.type == "cpu":
+            bones = self.texel_skin.blend(transforms)
+            return pose_fused(self.template, offset, appearance, sampling, self.texel_axes, *bones)
+        blended = blend_transforms(self.texel_weights, transforms)
         offsets = (self.texel_axes * sample_bilinear(offset, sampling)[..., None, :]).sum(-1)
         return pose_gaussians(self.template.activate(offsets, sample_bilinear(appearance, sampling)), blended)
 
@@ -246,9 +255,15 @@ class Avatar(nn.Module):
         self, motion_windows: Float[Tensor, "b t j 4 4"], output: NetworkOutput
     ) -> Float[Tensor, "b p 3"]:
         """Return the newest frame's control points, offset and posed, world metres."""
+        blended = blend_transforms(self.control.weights, motion_windows[:, :1])[:, 0]
+        return self.pose_control_points(blended, output)
+
+    def pose_control_points(
+        self, blended: Float[Tensor, "b p 3 4"], output: NetworkOutput
+    ) -> Float[Tensor, "b p 3"]:
+        """Return the control points, offset and posed by each one's blend of transforms, world metres."""
         offsets = self.gather_control_points(output.offset)
         points = self.control.points + (self.control.axes * offsets[..., None, :]).sum(-1)
-        blended = blend_transforms(self.control.weights, motion_windows[:, :1])[:, 0]
         return (blended[..., :3] * points[..., None, :]).sum(-1) + blended[..., 3]
 
 

@@ -13,12 +13,13 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from dsar.avatar.bilinear import BilinearSampling
-from dsar.avatar.posing import nearest_quaternions
 from dsar.avatar.template import SCALE_RANGE, GaussianParameters
 from dsar.geometry.harmonics import rotate_harmonics
 from dsar.raster.jit import kernel
 from dsar.types import Gaussians
 
+_FIELDS = 5
+"""Of Gaussians, in their order: those of the raw parameters, too."""
 _SMALLEST, _LARGEST = map(np.float32, SCALE_RANGE)
 
 
@@ -29,6 +30,7 @@ def pose_fused(
     sampling: BilinearSampling,
     axes: Float[Tensor, "n 3 3"],
     blended: Float[Tensor, "b n 3 4"],
+    bone_rotations: Float[Tensor, "b n 4"],
 ) -> list[Gaussians]:
     """Return the posed Gaussians of each batch entry; float32 in main memory only.
 
@@ -39,15 +41,16 @@ def pose_fused(
         sampling: how each texel is sampled from the maps.
         axes: columns are the offset's axes in the canonical frame.
         blended: the linear blend of bone transforms at each texel.
+        bone_rotations: its nearest rotation, unit wxyz.
     """
     values = torch.cat([offset, appearance], 1).flatten(2).transpose(1, 2)
-    bone_rotations = nearest_quaternions(blended[..., :3])
+    fields = _Pose.apply(
+        values, template.means, template.quaternions, template.log_scales, template.opacity_logits,
+        template.harmonics, *sampling, axes, blended, bone_rotations,
+    )  # fmt: skip
     posed = []
-    for entry, bone_rotation, transform in zip(values, bone_rotations, blended, strict=True):
-        means, rotations, scales, opacities, harmonics = _Pose.apply(
-            entry, template.means, template.quaternions, template.log_scales, template.opacity_logits,
-            template.harmonics, *sampling, axes, transform, bone_rotation,
-        )  # fmt: skip
+    for entry, bone_rotation in enumerate(bone_rotations):
+        means, rotations, scales, opacities, harmonics = fields[_FIELDS * entry : _FIELDS * (entry + 1)]
         if harmonics.shape[1] > 1:
             harmonics = rotate_harmonics(harmonics[None], bone_rotation[None])[0]
         posed.append(Gaussians(means, rotations, scales, opacities, harmonics))
@@ -55,27 +58,37 @@ def pose_fused(
 
 
 class _Pose(torch.autograd.Function):
-    """Values on the grid and raw parameters to posed Gaussians; the skeleton gets no gradient."""
+    """Values on the grid and raw parameters to the fields of each entry's posed Gaussians, in turn.
+
+    The skeleton gets no gradient. All entries are one node of the graph, so that the gradients of the raw
+    parameters, which they share, are added up where they arise.
+    """
 
     @staticmethod
     def forward(ctx: Any, *inputs: Tensor) -> tuple[Tensor, ...]:
-        arrays = [tensor.detach().contiguous().numpy() for tensor in inputs]
-        means, quaternions, log_scales, logits, harmonics = arrays[1:6]
-        outputs = [np.empty_like(a) for a in (means, quaternions, log_scales, logits, harmonics)]
-        _pose(*arrays, *outputs)
-        tensors = tuple(map(torch.from_numpy, outputs))
-        ctx.save_for_backward(*inputs, tensors[2], tensors[3])
-        return tensors
+        values, *rest = (tensor.detach().contiguous().numpy() for tensor in inputs)
+        raw, texels, bones = rest[:_FIELDS], rest[_FIELDS:-2], rest[-2:]
+        outputs = [np.empty((len(values), *array.shape), np.float32) for array in raw]
+        for entry in range(len(values)):
+            posed = [output[entry] for output in outputs]
+            _pose(values[entry], *raw, *texels, *(array[entry] for array in bones), *posed)
+        ctx.save_for_backward(*inputs)
+        ctx.activated = outputs[2:4]
+        return tuple(torch.from_numpy(output[entry]) for entry in range(len(values)) for output in outputs)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        arrays = [tensor.detach().contiguous().numpy() for tensor in ctx.saved_tensors]
-        values, means, quaternions, log_scales, logits, harmonics, *rest = arrays
-        inputs = (values, means, quaternions, log_scales, logits, harmonics)
-        v_inputs = [np.zeros_like(values), *(np.empty_like(a) for a in inputs[1:])]
-        _pose_backward(values, quaternions, *rest, *(g.contiguous().numpy() for g in gradients), *v_inputs)
-        return *map(torch.from_numpy, v_inputs), None, None, None, None, None
+        values, *rest = (tensor.detach().contiguous().numpy() for tensor in ctx.saved_tensors)
+        raw, texels, per_entry = rest[:_FIELDS], rest[_FIELDS:-2], (*rest[-2:], *ctx.activated)
+        v_values, v_raw = np.zeros_like(values), [np.zeros_like(array) for array in raw]
+        for entry in range(len(values)):
+            arriving = gradients[_FIELDS * entry : _FIELDS * (entry + 1)]
+            _pose_backward(
+                values[entry], raw[1], *texels, *(array[entry] for array in per_entry),
+                *(gradient.contiguous().numpy() for gradient in arriving), v_values[entry], *v_raw,
+            )  # fmt: skip
+        return *map(torch.from_numpy, (v_values, *v_raw)), None, None, None, None, None
 
 
 @kernel
@@ -124,7 +137,7 @@ def _pose_backward(
     v_means, v_rotations, v_scales, v_opacities, v_harmonics,
     out_values, out_means, out_quaternions, out_log_scales, out_logits, out_harmonics,
 ):  # fmt: skip
-    """Bring gradients of posed Gaussians back to raw parameters, and add them up in the grid's cells."""
+    """Add the gradients of posed Gaussians to those of raw parameters, and of the grid's cells."""
     n, bands = v_harmonics.shape[0], v_harmonics.shape[1]
     count = values.shape[1]
     r = np.empty(count, np.float32)
@@ -136,7 +149,9 @@ def _pose_backward(
         x = t[0, 0] * gx + t[1, 0] * gy + t[2, 0] * gz
         y = t[0, 1] * gx + t[1, 1] * gy + t[2, 1] * gz
         z = t[0, 2] * gx + t[1, 2] * gy + t[2, 2] * gz
-        out_means[i, 0], out_means[i, 1], out_means[i, 2] = x, y, z
+        out_means[i, 0] += x
+        out_means[i, 1] += y
+        out_means[i, 2] += z
         for k in range(3):
             r[k] = axes[i, 0, k] * x + axes[i, 1, k] * y + axes[i, 2, k] * z
         for c in range(3, 7):
@@ -162,12 +177,12 @@ def _pose_backward(
         for b in range(bands):
             for k in range(3):
                 r[11 + 3 * b + k] = v_harmonics[i, b, k]
-                out_harmonics[i, b, k] = v_harmonics[i, b, k]
+                out_harmonics[i, b, k] += v_harmonics[i, b, k]
         for k in range(4):
-            out_quaternions[i, k] = r[3 + k]
+            out_quaternions[i, k] += r[3 + k]
         for k in range(3):
-            out_log_scales[i, k] = r[7 + k]
-        out_logits[i] = r[10]
+            out_log_scales[i, k] += r[7 + k]
+        out_logits[i] += r[10]
         for c in range(count):
             out_values[i0, c] += w0 * r[c]
             out_values[i1, c] += w1 * r[c]

@@ -118,7 +118,12 @@ class MotionPrior(nn.Module):
     def __init__(self, charts: Sequence[Chart], control: ControlGrid, upsample: int, width: int) -> None:
         """Prepare for the garments of some charts, in texel rows of the atlas."""
         super().__init__()
-        self.garments = nn.ModuleList(GarmentPrior(chart, control, upsample, width) for chart in charts)
+        self.tubes = nn.ModuleList(GarmentPrior(chart, control, upsample, width) for chart in charts)
+
+    @property
+    def garments(self) -> list[GarmentPrior]:
+        """The simulations, in the order of their charts."""
+        return [tube for tube in self.tubes if isinstance(tube, GarmentPrior)]
 
     @property
     def placed(self) -> bool:
@@ -142,9 +147,8 @@ class MotionPrior(nn.Module):
         return torch.cat(every, 1)
 
     def _simulate_garment(
-        self, garment: nn.Module, body: Body, transforms: Float[Tensor, "f j 4 4"], fps: float
+        self, garment: GarmentPrior, body: Body, transforms: Float[Tensor, "f j 4 4"], fps: float
     ) -> Float[Tensor, "f g 6"]:
-        assert isinstance(garment, GarmentPrior)
         if not garment.placed:
             return transforms.new_zeros(len(transforms), len(garment.axes), CHANNELS)
         simulation = garment.simulation(body)

@@ -71,7 +71,7 @@ def _nearest_quaternions(matrices):
         for lane in range(LANES):
             for k in range(9):
                 scratch[k * LANES + lane] = matrices[min(start + lane, count - 1), k]
-        _find_quaternions(scratch)
+        find_quaternions(scratch)
         for lane in range(min(LANES, count - start)):
             for k in range(4):
                 result[start + lane, k] = scratch[k * LANES + lane]
@@ -79,7 +79,7 @@ def _nearest_quaternions(matrices):
 
 
 @inlined
-def _find_quaternions(scratch):
+def find_quaternions(scratch):
     """Replace matrices by quaternions: Newton's R <- (R + R^-T) / 2 (Higham 1986), then Shepperd's method."""
     a, b, c = planes(scratch, 0)
     d, e, f = planes(scratch, 3)

@@ -35,7 +35,7 @@ class Train(Common):
     steps: int | None = None
     """Updates in all."""
     minutes: float | None = None
-    """Wall-clock budget; the schedule is compressed to fit."""
+    """Limit on the time; where a machine is too slow for it, the schedule is compressed to fit."""
     workers: int | None = None
     """Processes, one core each."""
     resume: bool = False

@@ -59,8 +59,8 @@ class ModelConfig:
     """Time constants, seconds, of running means of the motion; for each, the displacement from the newest
     position to the mean is an input map (extension): a memory that nothing has to learn."""
     prior: Literal["cloth", "none"] = "cloth"
-    """`cloth`: a coarse simulation of each loose garment, driven by the same motion, is the base of the offset
-    and an input map (extension); `none`: the paper's. Without a loose garment there is none."""
+    """`cloth`: a coarse simulation of each loose garment, driven by the same motion, is an input map and the
+    base of the offset (extension); `none`: the paper's. Without a loose garment there is none."""
     pose_components: int = 0
     """New poses are projected onto so many principal components of the training poses, and kept within two
     standard deviations of each (Li et al. 2024); 0: they are taken as they are."""
@@ -150,13 +150,14 @@ class ScheduleConfig:
     steps: int = 1500
     """Updates in all."""
     minutes: float | None = None
-    """Wall-clock budget, counted from the end of the first update (which compiles kernels on a new machine):
-    the schedule is compressed to fit when the machine is too slow for `steps`."""
+    """Limit on the time of training, counted from the end of the first update (which compiles kernels on a
+    new machine). A machine that is fast enough does the same `steps` as without it; where it is too slow the
+    schedule is compressed to fit, and the run says that it was cut short."""
     template_fraction: float = 0.12
     """Fraction of the updates that fit the template alone, on near-rest frames."""
     pretraining_fraction: float = 0.2
     """Fraction of the updates that train the network on registered maps, without images; 0: no registration
-    (the paper's). Registration itself takes no updates, but its time is part of the budget."""
+    (the paper's). Registration itself takes no updates, but its time counts."""
     pose_only_fraction: float = 0.0
     """Fraction that trains the network without feedback and memory (the paper's stage 1)."""
     half_resolution_fraction: float = 0.85

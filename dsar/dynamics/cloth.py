@@ -14,29 +14,29 @@ class ClothConstants:
 
     drag: float = 2.0
     """Quadratic air drag along the normal, 1/m."""
-    damping: float = 0.5
+    damping: float = 0.3
     """Linear damping of the velocity, 1/s."""
-    viscosity: float = 6.0
+    viscosity: float = 10.0
     """Rate at which a point takes its neighbours' mean velocity, 1/s."""
-    friction: float = 0.5
+    friction: float = 0.6
     """Coulomb coefficient against the body."""
-    thickness: float = 0.006
+    thickness: float = 0.008
     """Distance kept from the body, metres."""
-    pull: float = 5.0
+    pull: float = 10.0
     """Stiffness of the way home, 1/s²."""
-    homing: float = 0.15
+    homing: float = 0.3
     """Damping of the velocity relative to home, 1/s."""
     core: float = 0.7
     """Share of its home's distance from the middle of its row within which no point comes."""
-    slack: float = 1.2
+    slack: float = 1.05
     """How much wider than at rest the hem is once its folds are stretched out."""
     give: float = 1.03
     """The same for the diagonals, which carry the waist's turning to the hem."""
-    shear: float = 2e-5
+    shear: float = 1e-5
     """Compliance of the grid's diagonals."""
-    bend: float = 1e-3
+    bend: float = 3e-4
     """Compliance of the two-apart struts that resist bending."""
-    fold: float = 1e-2
+    fold: float = 5e-3
     """Compliance of the struts a sixth of the way around that keep folds few and large."""
 
     @classmethod

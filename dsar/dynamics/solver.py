@@ -28,22 +28,14 @@ def simulate(
 ):  # fmt: skip
     """Advance the cloth through all frames but the first, whose state is given; all arrays are float32.
 
-    Args:
-        points, velocities: State of n = rows x columns points, row by row from the top; changed in place.
-            The first row is fixed to its home.
-        nearest: Index of the body point nearest to each; changed in place.
-        home: Where skinning carries the resting garment, [f, n, 3].
-        body, normals: Body points and outward unit normals, [f, b, 3].
-        neighbours: Body points around each, [b, k].
-        ends, lengths, compliances, sides: Distance constraints [m, 2], [m]; of side 1 they resist only being
-            stretched, of side -1 only being pressed, of side 0 both.
-        constants: Drag 1/m, damping 1/s, viscosity 1/s, friction, thickness m, and of the way home the
-            stiffness 1/s2 and damping 1/s; share of its home's distance from the middle of its row within
-            which no point comes.
-        shape: Rows and columns.
-        steps: Steps a frame.
-        fps: Frames a second.
-        positions: Receives the points at every frame but the first, [f - 1, n, 3].
+    `points` and `velocities` are the state of n = rows x columns points, row by row from the top, `nearest`
+    the index of the body point nearest to each; they are changed in place. The first row is fixed to its
+    `home`, [f, n, 3], where skinning carries the resting garment. `body` and `normals`, [f, b, 3], are points
+    of the body with outward unit normals, and `neighbours`, [b, k], those around each.
+
+    Distance constraints have `ends` [m, 2], `lengths` and `compliances` [m]; of `sides` 1 they resist only
+    being stretched, of -1 only being pressed, of 0 both. `constants` are `ClothConstants.of_motion`, `shape`
+    is rows and columns, and `steps` those of a frame. `positions`, [f - 1, n, 3], receives the points.
     """
     rows, columns = shape
     previous, before = np.empty_like(points), np.empty_like(points)

@@ -52,6 +52,13 @@ def mask_box(alpha: Shaped[np.ndarray, "h w"], margin: int) -> tuple[int, int, i
     rows, columns = np.flatnonzero(alpha.any(1)), np.flatnonzero(alpha.any(0))
     if not len(rows):
         return 0, 0, w, h
-    x0, x1 = max(int(columns[0]) - margin, 0), min(int(columns[-1]) + 1 + margin, w)
-    y0, y1 = max(int(rows[0]) - margin, 0), min(int(rows[-1]) + 1 + margin, h)
-    return x0, y0, x1, y1
+    tight = int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
+    return with_margin(tight, margin, w, h)
+
+
+def with_margin(
+    box: tuple[int, int, int, int], margin: int, width: int, height: int
+) -> tuple[int, int, int, int]:
+    """Return a box (x0, y0, x1, y1) widened by a margin, within an image."""
+    x0, y0, x1, y1 = box
+    return max(x0 - margin, 0), max(y0 - margin, 0), min(x1 + margin, width), min(y1 + margin, height)

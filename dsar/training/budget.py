@@ -38,6 +38,8 @@ class Budget:
     """Floating-point operations of the network, forward and backward."""
     parameters: int
     """Of the network."""
+    seconds: float = 0.0
+    """What these operations take on this machine, in one thread; 0: not measured."""
 
 
 def map_size(config: TrainConfig) -> tuple[int, int]:
@@ -114,7 +116,7 @@ def check_budget(config: TrainConfig, processes: int, done: float = 0.0, images:
             f"of at least {seconds:.1f} s; give --minutes or --steps, or take --preset small"
         )
     _log.info("An update needs %.1f s or more, a worker %.1f GiB", seconds, budget.memory / 2**30)
-    return budget
+    return dataclasses.replace(budget, seconds=seconds)
 
 
 def available_memory() -> int | None:

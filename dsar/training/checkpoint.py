@@ -270,12 +270,16 @@ class CheckpointProgress:
     """Share of the schedule that is done, in [0, 1]."""
     folder: str | None = None
     """The run's folder at that time; older checkpoints do not say it."""
+    seconds: float = 0.0
+    """Time that updates and registration took; 0 in older checkpoints, as are the next two."""
+    skipped: float = 0.0
+    """Updates of the schedule that were passed over, because time was short."""
+    unregistered: int = 0
+    """Frames that were not registered, because time was short."""
 
 
-def write_progress(folder: Path, step: int, progress: float, run: Run) -> None:
+def write_progress(folder: Path, content: CheckpointProgress) -> None:
     """Write where the run stands; written last, it marks a checkpoint as complete."""
-    # What the run refers to by path is found again from its folder, when all of it is moved.
-    content = CheckpointProgress(FORMAT_VERSION, step, progress, str(run.folder.resolve()))
     (folder / "progress.json").write_text(json.dumps(dataclasses.asdict(content)))
 
 
@@ -292,12 +296,15 @@ def read_progress(run: Run) -> CheckpointProgress:
         raise CheckpointError(
             f"{run.checkpoint} has format {version}, this version reads {OLDEST_VERSION} to {FORMAT_VERSION}"
         )
-    kinds = {"format_version": int, "step": int, "progress": int | float, "folder": str}
+    number = int | float
+    kinds = {"format_version": int, "step": int, "progress": number}
+    later = {"folder": str, "seconds": number, "skipped": number, "unregistered": int}
     with reading(path):
+        kinds |= {key: kind for key, kind in later.items() if key in content}
         for key, kind in kinds.items():
-            if not isinstance(content.get(key, "" if key == "folder" else None), kind):
+            if not isinstance(content.get(key), kind):
                 raise TypeError(f"{key} is {content.get(key)!r}")
-        return CheckpointProgress(**{key: content[key] for key in kinds if key in content})
+        return CheckpointProgress(**{key: content[key] for key in kinds})
 
 
 def check_files(run: Run) -> None:

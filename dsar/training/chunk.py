@@ -9,16 +9,16 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch import Tensor, nn
 
 from dsar.avatar.driving import DrivingSignal
-from dsar.avatar.input_maps import InputMaps
-from dsar.avatar.mirror import Mirror, mirror_motion
+from dsar.avatar.mirror import Mirror
 from dsar.config import TrainConfig
 from dsar.errors import TrainingError
 from dsar.network import STREAMS, NetworkOutput, Stream
 from dsar.raster import rasterize, reduced_dilation
+from dsar.training.driving_maps import DrivingFrames, DrivingMaps
+from dsar.training.kept_views import KeptViews
 from dsar.training.losses import image_loss, registered_loss, spatial_loss
 from dsar.training.report import UpdateMetrics
 from dsar.training.rollouts import RolloutCursor
@@ -26,7 +26,7 @@ from dsar.training.schedule import WHOLE_CLIP, ScheduleState
 from dsar.training.state import TrainingState
 from dsar.training.targets import Target, TargetLoader
 from dsar.training.temporal_losses import TemporalRecord, temporal_losses
-from dsar.types import Capture, Gaussians
+from dsar.types import Gaussians
 
 TEMPLATE_FRAMES = 8
 """Frames of an update of the template alone."""
@@ -38,12 +38,8 @@ class _Step:
 
     cursors: list[RolloutCursor]
     """Where each rollout stood."""
-    motion_window: Float[Tensor, "b t j 4 4"]
-    """Each one's motion, as it was filmed."""
-    driving_window: Float[Tensor, "b t j 4 4"]
-    """The same, or its mirror image: what drives the network."""
-    input_maps: InputMaps
-    """The network's input."""
+    driving: DrivingFrames
+    """What drives the network: of that motion or its mirror image."""
     output: NetworkOutput
     """The network's output."""
     unmirrored_output: NetworkOutput
@@ -56,7 +52,7 @@ class ChunkTrainer:
     def __init__(
         self,
         config: TrainConfig,
-        capture: Capture,
+        views: KeptViews,
         state: TrainingState,
         signals: Mapping[str, DrivingSignal],
         lpips: nn.Module | None,
@@ -65,16 +61,22 @@ class ChunkTrainer:
 
         Args:
             config: The settings of the run.
-            capture: Its images.
+            views: Its images.
             state: What is trained; rollouts and what they remember go on with every chunk.
             signals: Driving signals of the sequences.
             lpips: The LPIPS network, where it is used.
         """
         self.config, self.state, self.avatar = config, state, state.avatar
-        self.signals, self.lpips = signals, lpips
-        self.loader = TargetLoader(capture, max(1, (os.cpu_count() or 1) // config.workers))
+        self.lpips = lpips
+        self.loader = TargetLoader(views, max(1, (os.cpu_count() or 1) // config.workers))
         avatar = state.avatar
         self.mirror = Mirror(avatar.control) if config.schedule.mirrored_fraction else None
+        self.drive(signals)
+
+    def drive(self, signals: Mapping[str, DrivingSignal]) -> None:
+        """Take the driving signals of the sequences, and anew once the motion prior is fitted."""
+        self.signals = signals
+        self.driving = DrivingMaps(self.avatar, signals, mirrored=self.mirror is not None)
 
     def backward_template(self, rng: np.random.Generator, reduction: int) -> UpdateMetrics:
         """Back-propagate views of the template in the shapes it has in still frames."""
@@ -124,8 +126,7 @@ class ChunkTrainer:
                 for i in rendered
             ]
             step = self._step(cursors, fresh, streams=streams)
-            outputs = step.unmirrored_output.select(rendered)
-            batch = self.avatar.gaussians(step.motion_window[rendered], outputs) if rendered else []
+            batch = self._pose(step, rendered) if rendered else []
             for gaussians, frame_targets in zip(batch, targets, strict=True):
                 view = self._views(rng, gaussians, frame_targets, schedule_state.reduction)
                 losses["render"] = losses["render"] + view[0]
@@ -141,27 +142,22 @@ class ChunkTrainer:
         """Step every rollout by one frame, some of them afresh."""
         state = self.state
         state.network = state.network.restart(torch.tensor(fresh))
-        driving_window = motion_window = torch.stack(
-            [self.signals[c.sequence].windows[c.frame] for c in cursors]
+        driving = self.driving.gather(cursors)
+        output, state.network = self.avatar.network(
+            driving.maps, driving.magnitude, state.network, streams=streams
         )
-        mirrored, cloth = torch.tensor([cursor.mirrored for cursor in cursors]), self._cloth(cursors)
-        if self.mirror is not None:
-            driving_window = torch.where(
-                mirrored[:, None, None, None, None], mirror_motion(motion_window), motion_window
-            )
-            cloth = None if cloth is None else self.mirror.mirror_cloth(cloth, mirrored)
-        output, state.network, input_maps = self.avatar.forward_frame(
-            driving_window, state.network, cloth, streams=streams
-        )
+        output = dataclasses.replace(output, offset=output.offset + driving.base)
+        mirrored = torch.tensor([cursor.mirrored for cursor in cursors])
         unmirrored = self.mirror.unmirror(output, mirrored) if self.mirror is not None else output
         cursors = [dataclasses.replace(cursor) for cursor in cursors]
         state.rollouts.advance()
-        return _Step(cursors, motion_window, driving_window, input_maps, output, unmirrored)
+        return _Step(cursors, driving, output, unmirrored)
 
-    def _cloth(self, cursors: list[RolloutCursor]) -> Float[Tensor, "b g 6"] | None:
-        """Return the motion prior where each rollout stands."""
-        frames = [self.signals[cursor.sequence].cloth_at([cursor.frame]) for cursor in cursors]
-        return None if any(frame is None for frame in frames) else torch.cat(frames)
+    def _pose(self, step: _Step, rollouts: list[int]) -> list[Gaussians]:
+        """Return the posed Gaussians of some rollouts, as they were filmed."""
+        places = [step.cursors[index] for index in rollouts]
+        windows = torch.stack([self.signals[c.sequence].windows[c.frame, :1] for c in places])
+        return self.avatar.gaussians(windows, step.unmirrored_output.select(rollouts))
 
     def _detach_state(self) -> None:
         """Cut what the rollouts carry on from the graph of this chunk."""
@@ -212,8 +208,8 @@ class ChunkTrainer:
     def _temporal(self, step: _Step) -> dict[str, Tensor]:
         """Append this frame's record and return the temporal losses against the frames before it."""
         avatar, history = self.avatar, self.state.history
-        posed = avatar.deformed_control_points(step.driving_window, step.output)
-        history.append(TemporalRecord(step.output, posed), step.input_maps.magnitude)
+        posed = avatar.pose_control_points(step.driving.control_transforms, step.output)
+        history.append(TemporalRecord(step.output, posed), step.driving.speed)
         return temporal_losses(
             history.records,
             history.magnitudes,

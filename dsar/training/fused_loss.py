@@ -12,13 +12,10 @@ from jaxtyping import Float, Float32
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from dsar.raster.jit import inlined, kernel
+from dsar.raster.jit import kernel
+from dsar.training.fused_ssim import similarity
 
-_REACH, _SIGMA = 5, 1.5
-_WINDOW = np.exp(-(np.arange(-_REACH, _REACH + 1) ** 2) / (2 * _SIGMA**2))
-_WINDOW = (_WINDOW / _WINDOW.sum()).astype(np.float32)
-_C1, _C2 = np.float32(0.01**2), np.float32(0.03**2)
-_TWO, _ZERO = np.float32(2.0), np.float32(0.0)
+_ZERO, _QUARTER, _HALF, _ONE = map(np.float32, (0, 0.25, 0.5, 1))
 
 
 def fused_image_loss(
@@ -43,8 +40,8 @@ class _ImageLoss(torch.autograd.Function):
         color, alpha, truth, mask = (tensor.detach().contiguous().numpy() for tensor in tensors)
         loss, v_color = _pyramid(color - truth, levels, l1)
         if ssim:
-            similarity, v_similarity = _similarity(color, truth)
-            loss += ssim * (1 - similarity)
+            score, v_similarity = similarity(color, truth)
+            loss += ssim * (1 - score)
             v_color -= np.float32(ssim) * v_similarity
         difference = alpha - mask
         loss += cover * float(np.abs(difference).mean())
@@ -66,105 +63,48 @@ def _pyramid(
     pyramid = [difference]
     for _ in range(levels - 1):
         pyramid.append(_halved(pyramid[-1]))
-    loss = sum(float(np.abs(level).mean()) for level in pyramid) * weight / levels
-    gradient = np.zeros((0, 0, 3), np.float32)
+    loss, gradient = 0.0, np.zeros((0, 0, 3), np.float32)
     for level in reversed(pyramid):
-        gradient = _signs_and_coarser(level, gradient, np.float32(weight / levels / level.size))
-    return loss, gradient
+        mean, gradient = _mean_and_gradient(level, gradient, np.float32(weight / levels / level.size))
+        loss += mean
+    return loss * weight / levels, gradient
 
 
 @kernel
 def _halved(image):
     """Return means over blocks of 2 x 2 pixels; blocks at an odd border hold fewer."""
-    h, w = (image.shape[0] + 1) // 2, (image.shape[1] + 1) // 2
-    result = np.zeros((h, w, 3), np.float32)
-    for y in range(image.shape[0]):
-        for x in range(image.shape[1]):
-            for c in range(3):
-                result[y // 2, x // 2, c] += image[y, x, c]
+    height, width = image.shape[0], image.shape[1]
+    h, w = (height + 1) // 2, (width + 1) // 2
+    result = np.empty((h, w, 3), np.float32)
     for y in range(h):
+        above, below = image[2 * y], image[min(2 * y + 1, height - 1)]
         for x in range(w):
-            count = min(2, image.shape[0] - 2 * y) * min(2, image.shape[1] - 2 * x)
+            left, right = 2 * x, min(2 * x + 1, width - 1)
             for c in range(3):
-                result[y, x, c] /= np.float32(count)
+                # A block at a border holds its pixels twice, which leaves its mean.
+                total = above[left, c] + above[right, c] + below[left, c] + below[right, c]
+                result[y, x, c] = _QUARTER * total
     return result
 
 
 @kernel
-def _signs_and_coarser(level, coarser, weight):
-    """Return the gradient by one level: its own signs, and its share of the coarser level's gradient."""
-    result = np.empty(level.shape, np.float32)
-    h, w = level.shape[0], level.shape[1]
-    for y in range(h):
-        for x in range(w):
-            share = _ZERO
-            if len(coarser) > 0:
-                share = np.float32(1 / (min(2, h - y // 2 * 2) * min(2, w - x // 2 * 2)))
+def _mean_and_gradient(level, coarser, weight):
+    """Return a level's mean absolute difference, and the gradient of it and of coarser levels by the level.
+
+    The gradient is the signs of the differences, and each pixel's share of the coarser level's gradient.
+    """
+    height, width = level.shape[0], level.shape[1]
+    result, total = np.empty(level.shape, np.float32), 0.0
+    for y in range(height):
+        sums, alone_below = _ZERO, y == height - 1 and height % 2 == 1
+        for x in range(width):
+            alone = x == width - 1 and width % 2 == 1
+            share = (_ONE if alone else _HALF) * (_ONE if alone_below else _HALF)
             for c in range(3):
-                own = weight if level[y, x, c] > 0 else (-weight if level[y, x, c] < 0 else _ZERO)
-                result[y, x, c] = own + (share * coarser[y // 2, x // 2, c] if len(coarser) > 0 else _ZERO)
-    return result
-
-
-@inlined
-def _blur(image, window, across, out):
-    """Blur the rows and columns of an [h, w * 3] image with the window, zero outside."""
-    h, n = image.shape
-    for y in range(h):
-        across[y] = window[_REACH] * image[y]
-        for tap in range(1, _REACH + 1):
-            weight, shift = window[_REACH + tap], 3 * tap
-            if shift < n:
-                for x in range(n - shift):
-                    across[y, x] += weight * image[y, x + shift]
-                for x in range(n - shift):
-                    across[y, x + shift] += weight * image[y, x]
-    for y in range(h):
-        out[y] = window[_REACH] * across[y]
-        for tap in range(1, _REACH + 1):
-            weight = window[_REACH + tap]
-            if y + tap < h:
-                for x in range(n):
-                    out[y, x] += weight * across[y + tap, x]
-            if y - tap >= 0:
-                for x in range(n):
-                    out[y, x] += weight * across[y - tap, x]
-
-
-def _similarity(
-    image: Float32[np.ndarray, "h w 3"], truth: Float32[np.ndarray, "h w 3"]
-) -> tuple[float, Float32[np.ndarray, "h w 3"]]:
-    """Return the mean structural similarity of two images in [0, 1], and its gradient by the first."""
-    h, w, _ = image.shape
-    similarity, gradient = _ssim(image.reshape(h, 3 * w), truth.reshape(h, 3 * w), _WINDOW)
-    return similarity, gradient.reshape(h, w, 3)
-
-
-@kernel
-def _ssim(x, y, window):
-    shape = x.shape
-    across = np.empty(shape, np.float32)
-    mx, my, mxx = np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.float32)
-    myy, mxy = np.empty(shape, np.float32), np.empty(shape, np.float32)
-    _blur(x, window, across, mx)
-    _blur(y, window, across, my)
-    _blur(x * x, window, across, mxx)
-    _blur(y * y, window, across, myy)
-    _blur(x * y, window, across, mxy)
-    total, per_pixel = 0.0, np.float32(1 / x.size)
-    for i in range(shape[0]):
-        for j in range(shape[1]):
-            u, v = mx[i, j], my[i, j]
-            a, b = _TWO * u * v + _C1, _TWO * (mxy[i, j] - u * v) + _C2
-            c, d = u * u + v * v + _C1, mxx[i, j] - u * u + myy[i, j] - v * v + _C2
-            score = a * b / (c * d)
-            total += score
-            # Derivatives by the blurred x, x² and xy, in the places of what they no longer need.
-            mx[i, j] = per_pixel * _TWO * (v * (b - a) / (c * d) + u * score * (1 / d - 1 / c))
-            mxx[i, j] = -per_pixel * score / d
-            mxy[i, j] = per_pixel * _TWO * a / (c * d)
-    # The blur is its own transpose.
-    _blur(mx, window, across, my)
-    _blur(mxx, window, across, myy)
-    _blur(mxy, window, across, mx)
-    return total / x.size, my + _TWO * x * myy + y * mx
+                value = level[y, x, c]
+                sums += abs(value)
+                # Without a branch: signs of noise are guessed wrong half of the time.
+                own = weight * (np.float32(value > 0) - np.float32(value < 0))
+                result[y, x, c] = own + share * coarser[y >> 1, x >> 1, c] if len(coarser) > 0 else own
+        total += sums
+    return total / level.size, result

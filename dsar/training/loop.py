@@ -21,16 +21,18 @@ from dsar.training import workers
 from dsar.training.budget import check_budget
 from dsar.training.checkpoint import Run, check_files, load_checkpoint, read_config, read_progress
 from dsar.training.chunk import ChunkTrainer
+from dsar.training.kept_views import KeptViews, kept_bytes
 from dsar.training.optimizers import set_rates
 from dsar.training.pace import Clock, leave, stop_signals
 from dsar.training.prior_fitting import fit_prior
 from dsar.training.registration import Registration
-from dsar.training.report import REPORT_EVERY, Monitor, Reporter, UpdateMetrics
+from dsar.training.report import REPORT_EVERY, Monitor, Reporter, UpdateMetrics, warn_if_cut_short
 from dsar.training.resuming import check_same_settings, resumed_settings, with_body
 from dsar.training.scene import scene_of_capture, write_scene
 from dsar.training.schedule import ScheduleState, schedule_at, without_pretraining
 from dsar.training.state import TrainingState
 from dsar.training.state_files import read_checkpoint, write_checkpoint
+from dsar.training.time_limit import TimeLimit, part_at
 from dsar.types import Capture
 
 SAVE_EVERY = 200
@@ -70,14 +72,17 @@ def train(config: TrainConfig, run: Run, *, resume: bool = False, report: Report
         check_files(run)
         check_same_settings(config, resumed_settings(run, config, whole), run)
     done = read_progress(run).progress if resume else 0.0
-    check_budget(config, workers.local_count(config.workers), done, capture.kept_bytes)
+    images = capture.kept_bytes + kept_bytes(capture)
+    budget = check_budget(config, workers.local_count(config.workers), done, images)
     write_scene(run.scene, scene_of_capture(whole))
     write_text_atomically(run.config, config_to_json(config))
-    workers.run_workers(config.workers, _train, (config, run.folder, resume), report)
+    workers.run_workers(config.workers, _train, (config, run.folder, resume, budget.seconds), report)
     return run
 
 
-def _train(config: TrainConfig, folder: Path, resume: bool, report: Reporter | None) -> None:
+def _train(
+    config: TrainConfig, folder: Path, resume: bool, network_seconds: float, report: Reporter | None
+) -> None:
     """Train in one worker, from the capture to the last checkpoint."""
     torch.manual_seed(config.seed)
     run, capture = Run(folder), capture_of(config).with_cameras(config.cameras)
@@ -90,14 +95,15 @@ def _train(config: TrainConfig, folder: Path, resume: bool, report: Reporter | N
     signals = {name: avatar.driving_signal(capture.motions[name]) for name in clips}
     still = rest_frames(capture, signals, clips, avatar.fps)
     state = TrainingState.begin(config, capture, avatar.train(), clips, still)
-    trainer = ChunkTrainer(config, capture, state, signals, lpips)
-    registration = Registration(config, capture, avatar, state.rest, state.registered, signals)
+    views = KeptViews(capture)
+    trainer = ChunkTrainer(config, views, state, signals, lpips)
+    registration = Registration(config, views, avatar, state.rest, state.registered, signals)
     gradients = workers.Gradients([*avatar.parameters(), *state.rest.parameters()])
     if resume:
         read_checkpoint(run, state)
-        signals.update({name: avatar.with_cloth(signal) for name, signal in signals.items()})
     schedule = config.schedule if state.registered.clips else without_pretraining(config.schedule)
-    clock, used, stop = Clock(schedule.minutes), 0.0, False
+    limit = TimeLimit(schedule, state.seconds, workers.mean(network_seconds))
+    clock, stop = Clock(), False
     monitor = Monitor(run.metrics, schedule.steps, report, began=state.progress)
     with stop_signals() as received:
         while state.progress < 1:
@@ -108,18 +114,20 @@ def _train(config: TrainConfig, folder: Path, resume: bool, report: Reporter | N
             schedule_state = schedule_at(schedule, state.progress)
             if schedule_state.stage != "template" and not state.registered.complete:
                 show = partial(monitor.show, state.step, state.progress, "registration")
-                stop, used = _register(registration, gradients, received, clock, used, show)
+                stop = _register(registration, gradients, received, clock, limit, state.progress, show)
+                state.seconds = limit.seconds
                 continue
             if schedule_state.stage != "template" and avatar.prior is not None and not avatar.prior.placed:
                 fit_prior(avatar, state.registered, signals, still, config.seed)
-                signals.update({name: avatar.with_cloth(signal) for name, signal in signals.items()})
+                signals = {name: avatar.with_cloth(signal) for name, signal in signals.items()}
                 avatar.fit_input_statistics(list(signals.values()))
+                trainer.drive(signals)
             set_rates(state.optimizers, schedule_state)
             rng = np.random.default_rng([config.seed, workers.rank(), state.step])
             gradients.clear()
             metrics = _backward(trainer, rng, schedule_state, state.step)
             monitor.update(metrics)
-            before, (stop, used) = used, gradients.average(bool(received), clock.used())
+            stop, seconds = gradients.average(bool(received), clock.seconds())
             if not gradients.buffer.isfinite().all():
                 bad = _bad_gradient(avatar)
                 raise TrainingError(f"step {state.step}: the gradient of {bad} is not finite")
@@ -127,13 +135,15 @@ def _train(config: TrainConfig, folder: Path, resume: bool, report: Reporter | N
             for optimizer in state.optimizers.values():
                 optimizer.step()
             clock.start()
-            state.step += 1
-            speedup = state.registered.schedule_speedup(schedule.template_fraction)
-            state.progress = max(state.step / schedule.steps, state.progress + (used - before) * speedup)
+            limit.note(part_at(schedule, state.progress), seconds)
+            state.seconds = limit.seconds
+            state.advance(schedule.steps, limit.passes_over(state.progress, state.registered.frames_left))
             if workers.rank() == 0 and (state.step % REPORT_EVERY == 0 or state.progress >= 1):
-                monitor.write(state.step, state.progress, schedule_state.stage, clock.seconds())
+                monitor.write(state.step, state.progress, schedule_state.stage, clock.seconds(), state.cut)
             if state.progress >= 1 or state.step % SAVE_EVERY == 0:
                 write_checkpoint(run, state)
+    if workers.rank() == 0:
+        warn_if_cut_short(state.step, state.cut, schedule.minutes)
 
 
 def _register(
@@ -141,28 +151,25 @@ def _register(
     gradients: workers.Gradients,
     received: list[int],
     clock: Clock,
-    before: float,
+    limit: TimeLimit,
+    progress: float,
     show: Callable[[float, UpdateMetrics], None],
-) -> tuple[bool, float]:
-    """Fit the registered maps; return whether a stop came before the last, and the time used so far.
-
-    `before` is the time used when they were begun.
-    """
+) -> bool:
+    """Fit the registered maps; return whether a stop came before the last."""
     # Clocks differ by a little, but all workers must agree: only numbers that they share count.
-    maps = registration.maps
-    began = maps.budget_used - before
+    maps, stop, late = registration.maps, False, False
     registration.avatar.unhide_covered_texels()
-    stop, used = False, 0.0
-    while not (stop or maps.complete):
+    while not (stop or late or maps.complete):
         metrics = registration.fit_next()
         gradients.clear()
-        stop, used = gradients.average(bool(received), clock.used())
-        maps.budget_used = began + used
+        stop, seconds = gradients.average(bool(received), clock.seconds())
+        limit.note("registration", seconds)
+        late = limit.ends_registration(progress, maps.frames_left)
         if metrics is not None and maps.count % REPORT_EVERY == 0:
             show(clock.seconds(), metrics)
-    if maps.complete:
+    if late or maps.complete:
         maps.all_gather()
-    return stop, used
+    return stop
 
 
 def _backward(

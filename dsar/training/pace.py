@@ -1,4 +1,4 @@
-"""When training ends before its last update: the budget of time, and signals to stop."""
+"""When training ends before its last update: the time it takes, and signals to stop."""
 
 import signal
 import time
@@ -11,8 +11,7 @@ from dsar.training import workers
 class Clock:
     """The time since the first update, which compiles kernels where they never ran before."""
 
-    def __init__(self, minutes: float | None) -> None:
-        self.minutes = minutes
+    def __init__(self) -> None:
         self.began: float | None = None
 
     def start(self) -> None:
@@ -22,10 +21,6 @@ class Clock:
     def seconds(self) -> float:
         """Return the seconds counted."""
         return 0.0 if self.began is None else time.monotonic() - self.began
-
-    def used(self) -> float:
-        """Return the share of the budget used; 0 without a budget."""
-        return 0.0 if self.minutes is None else self.seconds() / (60 * self.minutes)
 
 
 @contextmanager

@@ -1,8 +1,8 @@
 """What kind of cloth a garment is: constants of its simulation, found from the registered maps.
 
-Images say where cloth went; registration has read it from them. Of all kinds of cloth the simulation takes the
-one that goes there, too. Far from what cloth usually is, it has to explain a lot more: a few motions could be
-explained by odd constants which fail on others.
+Images say where cloth went, and registration has read it from them. Of all kinds of cloth the simulation
+takes the one that goes there, too. One that is far from usual cloth has to explain more: odd constants can
+explain a few motions and fail on others.
 """
 
 import dataclasses
@@ -62,7 +62,6 @@ def fit_prior(
         return
     first = 0
     for garment in avatar.prior.garments:
-        assert isinstance(garment, GarmentPrior)
         points = avatar.garment_control_points()[first : first + len(garment.axes)]
         first += len(garment.axes)
         _Fit(avatar, garment, points, maps, signals, rest_frames).run(seed)
@@ -121,9 +120,8 @@ class _Fit:
         """Return the loss of each of some constants; each worker computes its share."""
         losses = torch.zeros(len(tried), dtype=torch.float64)
         for index in range(workers.rank(), len(tried), workers.world_size()):
-            losses[index] = self._loss(constants_at(tried[index])) + USUAL * float(
-                np.square(tried[index]).sum()
-            )
+            unusual = USUAL * float(np.square(tried[index]).sum())
+            losses[index] = self._loss(constants_at(tried[index])) + unusual
         workers.all_reduce([losses])
         return losses.tolist()
 

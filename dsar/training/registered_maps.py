@@ -12,9 +12,6 @@ from dsar.training import workers
 from dsar.training.rollouts import RolloutCursor
 from dsar.types import Capture
 
-LIMIT = 0.4
-"""Largest share of a budget of time; frames that are left by then stay without a map."""
-
 
 class RegisteredMaps:
     """A map for each frame of each sequence, as far as they are fitted, and what fitting them took."""
@@ -36,8 +33,6 @@ class RegisteredMaps:
         """Frames of each clip that have a map, counted from its first."""
         self.count = 0
         """Frames fitted by the busiest worker."""
-        self.budget_used = 0.0
-        """Share of the budget of time that was used."""
 
     @classmethod
     def begin(
@@ -58,9 +53,19 @@ class RegisteredMaps:
         return max(sum(len(self.clips[name]) for name in share) for share in self.shares)
 
     @property
+    def frames_left(self) -> int:
+        """Frames that the busiest worker has yet to fit."""
+        return max(self.longest - self.count, 0)
+
+    @property
     def complete(self) -> bool:
-        """Whether every worker has fitted its frames, or time is up."""
-        return self.count >= self.longest or self.budget_used >= LIMIT
+        """Whether every worker has fitted its frames, or will fit no more."""
+        return self.count >= self.longest
+
+    @property
+    def unregistered(self) -> int:
+        """Frames that got no map, because time was short."""
+        return sum(len(clip) - int(self.fitted[name]) for name, clip in self.clips.items())
 
     def has_map(self, sequence: str, frame: int) -> bool:
         """Return whether a frame has a map that the network can learn from."""
@@ -85,13 +90,8 @@ class RegisteredMaps:
         ]
         return torch.stack(maps), torch.tensor(has_map)
 
-    def schedule_speedup(self, template_fraction: float) -> float:
-        """Return the factor by which later stages advance faster than time, for what registration took."""
-        left = 1 - template_fraction
-        return left / (left - self.budget_used) if self.complete else 1.0
-
     def all_gather(self) -> None:
-        """Give all workers what each has fitted."""
+        """Give all workers what each has fitted; it ends registration."""
         workers.all_reduce([*self.offsets.values(), *self.fitted.values()])
         self.count = self.longest
 
@@ -99,8 +99,7 @@ class RegisteredMaps:
         """Return the maps, and how far fitting them has come."""
         tensors = {f"offsets.{name}": maps for name, maps in self.offsets.items()}
         tensors |= {f"fitted.{name}": fitted for name, fitted in self.fitted.items()}
-        used = torch.tensor(self.budget_used, dtype=torch.float64)
-        return tensors | {"count": torch.tensor(self.count), "used": used}
+        return tensors | {"count": torch.tensor(self.count)}
 
     def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
         """Restore what `state_dict` returned.
@@ -110,7 +109,7 @@ class RegisteredMaps:
         """
         self.offsets = {name: tensors[f"offsets.{name}"] for name in self.offsets}
         self.fitted = {name: tensors[f"fitted.{name}"] for name in self.fitted}
-        self.count, self.budget_used = int(tensors["count"]), float(tensors["used"])
+        self.count = int(tensors["count"])
 
 
 def divide_sequences(clips: Mapping[str, range], workers: int) -> list[list[str]]:

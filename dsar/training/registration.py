@@ -21,12 +21,12 @@ from dsar.config import TrainConfig
 from dsar.geometry.cameras import project
 from dsar.raster import rasterize, reduced_dilation
 from dsar.training import workers
+from dsar.training.kept_views import KeptViews
 from dsar.training.losses import image_loss, spatial_loss
 from dsar.training.registered_maps import RegisteredMaps
 from dsar.training.report import UpdateMetrics
 from dsar.training.rest import RestOffsets
 from dsar.training.targets import Target, load_target
-from dsar.types import Capture
 
 REDUCTION = 2
 """Factor by which images are reduced."""
@@ -57,7 +57,7 @@ class Registration:
     def __init__(
         self,
         config: TrainConfig,
-        capture: Capture,
+        views: KeptViews,
         avatar: Avatar,
         rest: RestOffsets,
         maps: RegisteredMaps,
@@ -67,13 +67,14 @@ class Registration:
 
         Args:
             config: The settings of the run.
-            capture: Its images.
+            views: Its images.
             avatar: With a template that is fitted.
             rest: The garment in still frames.
             maps: What is fitted; those of this worker's sequences change.
             signals: Driving signals of the sequences.
         """
-        self.capture, self.avatar, self.signals, self.seed = capture, avatar, signals, config.seed
+        self.views, self.capture = views, views.capture
+        self.avatar, self.signals, self.seed = avatar, signals, config.seed
         self.rest, self.maps = rest, maps
         self.loss = dataclasses.replace(config.loss, **STRUCTURE)
         self.garment = avatar.garment_control_points()
@@ -182,7 +183,7 @@ class Registration:
 
     def _view(self, name: str, frame: int, camera: int, points: Float[Tensor, "g 3"]) -> tuple[Target, float]:
         """Return a view of the garment around its points in the world, and its share of the person's view."""
-        target = load_target(self.capture, name, frame, camera, REDUCTION)
+        target = load_target(self.views, name, frame, camera, REDUCTION)
         pixels = project(target.camera, points)[0]
         height, width = target.alpha.shape
         low, high = pixels.amin(0).floor().long() - MARGIN, pixels.amax(0).ceil().long() + MARGIN

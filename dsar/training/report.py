@@ -54,6 +54,10 @@ class Report:
     """Seconds until the end at the pace of this process; None before it has one."""
     gradients: dict[str, float] | None = None
     """Each regulariser's gradient as a share of the images', when they were last compared."""
+    skipped: int = 0
+    """Updates of the schedule that were passed over so far, because time was short."""
+    unregistered: int = 0
+    """Frames that were not registered, because time was short."""
 
 
 Reporter = Callable[[Report], None]
@@ -77,10 +81,15 @@ class Monitor:
                 effect = "moves almost nothing" if share < 1 else "outweighs the images"
                 _log.warning("Loss %s %s: its gradient is %.2g times theirs", name, effect, share)
 
-    def write(self, step: int, progress: float, stage: str, seconds: float) -> None:
-        """Append a line of smoothed values to metrics.jsonl and show it to the listener."""
+    def write(
+        self, step: int, progress: float, stage: str, seconds: float, cut: tuple[int, int] = (0, 0)
+    ) -> None:
+        """Append a line of smoothed values to metrics.jsonl and show it to the listener.
+
+        `cut` are the updates that were passed over, and the frames that were not registered.
+        """
         assert self._smoothed is not None
-        line = self._line(step, progress, stage, seconds, self._smoothed)
+        line = self._line(step, progress, stage, seconds, self._smoothed, cut)
         with naming_storage_errors(self._metrics), self._metrics.open("ab+") as file:
             # What a killed run has left of a line stays one by itself.
             whole = file.tell() == 0 or (file.seek(-1, os.SEEK_END) >= 0 and file.read(1) == b"\n")
@@ -93,15 +102,34 @@ class Monitor:
     def show(self, step: int, progress: float, stage: str, seconds: float, metrics: UpdateMetrics) -> None:
         """Show the listener work that counts as no update."""
         if self._reporter is not None:
-            self._reporter(self._line(step, progress, stage, seconds, metrics))
+            self._reporter(self._line(step, progress, stage, seconds, metrics, (0, 0)))
 
-    def _line(self, step: int, progress: float, stage: str, seconds: float, metrics: UpdateMetrics) -> Report:
+    def _line(
+        self,
+        step: int,
+        progress: float,
+        stage: str,
+        seconds: float,
+        metrics: UpdateMetrics,
+        cut: tuple[int, int],
+    ) -> Report:
         psnr = decibels(metrics.mse or 0.0)
         gained = progress - self._began
         left = seconds * (1 - progress) / gained if gained > 0 else None
-        return Report(
-            step, self._steps, progress, stage, metrics.loss, psnr, seconds, left, metrics.gradients
+        numbers = (step, self._steps, progress, stage, metrics.loss, psnr, seconds, left, metrics.gradients)
+        return Report(*numbers, *cut)
+
+
+def warn_if_cut_short(step: int, cut: tuple[int, int], minutes: float | None) -> None:
+    """Log what a run that is done left out for the limit on its time."""
+    skipped, unregistered = cut
+    if skipped:
+        _log.warning(
+            "Cut short: %d of %d updates; the schedule was compressed to fit into %g minutes",
+            *(step, step + skipped, minutes),
         )
+    if unregistered:
+        _log.warning("Cut short: %d frames were not registered, for lack of time", unregistered)
 
 
 def _smooth(before: UpdateMetrics | None, newest: UpdateMetrics) -> UpdateMetrics:

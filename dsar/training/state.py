@@ -39,6 +39,15 @@ class TrainingState:
     """Updates done."""
     progress: float = 0.0
     """Share of the schedule that is done, in [0, 1]."""
+    skipped: float = 0.0
+    """Updates of the schedule that were passed over, because time was short."""
+    seconds: float = 0.0
+    """Time that updates and registration took."""
+
+    @property
+    def cut(self) -> tuple[int, int]:
+        """How many updates were passed over, and how many frames not registered, because time was short."""
+        return round(self.skipped), self.registered.unregistered if self.registered.complete else 0
 
     @classmethod
     def begin(
@@ -68,6 +77,14 @@ class TrainingState:
             history=TemporalHistory(config.model.window),
             registered=RegisteredMaps.begin(config, capture, avatar, clips),
         )
+
+    def advance(self, steps: int, skipped: float) -> None:
+        """Count an update of so many planned ones, and those that are passed over with it."""
+        self.step += 1
+        self.skipped += skipped
+        # A share of whole numbers, as long as it can be: sums of shares would round.
+        by_count, onward = self.step / steps, min(self.progress + (1 + skipped) / steps, 1.0)
+        self.progress = onward if self.skipped else max(by_count, self.progress)
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return all of it as named tensors; the first part of a name says of what it is."""

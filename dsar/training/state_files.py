@@ -15,6 +15,8 @@ from dsar.errors import CheckpointError
 from dsar.text import decode_text
 from dsar.training import workers
 from dsar.training.checkpoint import (
+    FORMAT_VERSION,
+    CheckpointProgress,
     Run,
     describe_avatar,
     read_progress,
@@ -55,7 +57,7 @@ def write_checkpoint(run: Run, state: TrainingState) -> None:
             _write_part(folder / f"{part}-{rank}.safetensors", _part(tensors, part))
         workers.barrier()
         if rank == 0:
-            write_progress(folder, state.step, state.progress, run)
+            write_progress(folder, _progress(state, run))
             replace_folder(folder, run.checkpoint)
         workers.barrier()
 
@@ -79,7 +81,13 @@ def read_checkpoint(run: Run, state: TrainingState) -> None:
                 if at.format_version == OLDEST_VERSION:
                     tensors |= _read_cursors(path.with_suffix(".json"))
             state.load_state_dict({f"{part}.{name}": value for name, value in tensors.items()})
-    state.step, state.progress = at.step, at.progress
+    state.step, state.progress, state.skipped, state.seconds = at.step, at.progress, at.skipped, at.seconds
+
+
+def _progress(state: TrainingState, run: Run) -> CheckpointProgress:
+    # What the run refers to by path is found again from its folder, when all of it is moved.
+    where = FORMAT_VERSION, state.step, state.progress, str(run.folder.resolve())
+    return CheckpointProgress(*where, state.seconds, state.skipped, state.cut[1])
 
 
 def _read_cursors(path: Path) -> dict[str, Tensor]:

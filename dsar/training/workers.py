@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from dsar.errors import DsarError, TrainingError
 
 EXTRA_NUMBERS = 2
-"""Extra numbers that travel with the gradients: a request to stop, and the share of the budget used."""
+"""Extra numbers that travel with the gradients: a request to stop, and the time that was taken."""
 _BACKEND = "gloo"
 _ERROR_TIMEOUT_S, _JOIN_TIMEOUT_S = 5.0, 30.0
 """How long a worker that broke the group may take to say why, and one that is done to end."""
@@ -43,19 +43,19 @@ class Gradients:
         """Set every gradient to zero, keeping the parameters' views into the buffer."""
         self.buffer.zero_()
 
-    def average(self, stop: bool, used: float) -> tuple[bool, float]:
-        """Replace gradients by their mean over workers; return whether any asked to stop, and the time used.
+    def average(self, stop: bool, seconds: float) -> tuple[bool, float]:
+        """Replace gradients by their mean over workers; return whether any asked to stop, and the time.
 
         Only the first worker's clock counts, so that all see the same number.
         """
         self.buffer[-2] = float(stop)
-        self.buffer[-1] = used if rank() == 0 else 0.0
+        self.buffer[-1] = seconds if rank() == 0 else 0.0
         if dist.is_initialized():
             dist.all_reduce(self.buffer)
-        stopped, share = bool(self.buffer[-2] > 0), float(self.buffer[-1])
+        stopped, shared = bool(self.buffer[-2] > 0), float(self.buffer[-1])
         if dist.is_initialized():
             self.buffer /= world_size()
-        return stopped, share
+        return stopped, shared
 
 
 def rank() -> int:
@@ -77,6 +77,13 @@ def barrier() -> None:
     """Wait for all workers."""
     if dist.is_initialized():
         dist.barrier()
+
+
+def mean(value: float) -> float:
+    """Return the mean of all workers' values, the same for all."""
+    shared = torch.tensor(value, dtype=torch.float64)
+    all_reduce([shared])
+    return float(shared) / world_size()
 
 
 def all_reduce(tensors: Iterable[Tensor]) -> None:

@@ -14,6 +14,7 @@ from dsar.data.captures.formats import open_capture
 from dsar.evaluation.garment_metrics import measure_garment
 from dsar.raster import rasterize
 from dsar.training.chunk import ChunkTrainer
+from dsar.training.kept_views import KeptViews
 from dsar.training.optimizers import set_rates
 from dsar.training.schedule import ScheduleState
 from dsar.training.state import TrainingState
@@ -104,7 +105,7 @@ def test_the_network_trains_with_the_whole_body_the_template_without_what_is_ben
     avatar = Avatar.from_capture(capture, capture.body, config.atlas, config.model).train()
     state = TrainingState.begin(config, capture, avatar, {"sway": range(3)}, [("sway", 0)])
     signals = {"sway": avatar.driving_signal(capture.motions["sway"])}
-    trainer = ChunkTrainer(config, capture, state, signals, None)
+    trainer = ChunkTrainer(config, KeptViews(capture), state, signals, None)
     hidden = avatar.texel_hidden.clone()
     Gradients(list(avatar.parameters())).clear()
     trainer.backward_template(np.random.default_rng(0), 2)
@@ -139,7 +140,7 @@ def test_one_fitted_frame_covers_the_mask(capture, sequence, frame):
     clips = {sequence: range(frame + 1)}
     state = TrainingState.begin(config, capture, avatar, clips, [(sequence, frame)])
     signals = {sequence: avatar.driving_signal(capture.motions[sequence])}
-    trainer = ChunkTrainer(config, capture, state, signals, None)
+    trainer = ChunkTrainer(config, KeptViews(capture), state, signals, None)
     gradients = Gradients([*avatar.parameters(), *state.rest.parameters()])
     for step in range(110):
         reduction, factor = (2, 1.0) if step < 50 else (1, 0.5)

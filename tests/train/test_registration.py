@@ -14,12 +14,14 @@ from dsar.data.captures.formats import open_capture
 from dsar.evaluation.garment_metrics import distance_to_mesh
 from dsar.training import loop
 from dsar.training.chunk import ChunkTrainer
+from dsar.training.kept_views import KeptViews
 from dsar.training.optimizers import set_rates
 from dsar.training.registered_maps import RegisteredMaps, divide_sequences
 from dsar.training.registration import Registration
 from dsar.training.rest import PULL, RestOffsets
 from dsar.training.schedule import schedule_at, without_pretraining
 from dsar.training.state import TrainingState
+from dsar.training.time_limit import TimeLimit
 from dsar.training.workers import Gradients
 
 SEQUENCE = "spin_right"
@@ -37,7 +39,7 @@ def registered():
     signals = {name: avatar.driving_signal(capture.motions[name]) for name in every}
     still = loop.rest_frames(capture, signals, every, avatar.fps)
     state = TrainingState.begin(config, capture, avatar, every, still)
-    trainer = ChunkTrainer(config, capture, state, signals, None)
+    trainer = ChunkTrainer(config, KeptViews(capture), state, signals, None)
     gradients = Gradients([*avatar.parameters(), *state.rest.parameters()])
     for step in range(60):
         set_rates(state.optimizers, schedule_at(config.schedule, 0.12 * step / 60))
@@ -47,9 +49,9 @@ def registered():
     avatar.unhide_covered_texels()
     clips = {SEQUENCE: range(4, LAST + 1)}
     state.registered = RegisteredMaps.begin(config, capture, avatar, clips)
-    registration = Registration(config, capture, avatar, state.rest, state.registered, signals)
+    registration = Registration(config, KeptViews(capture), avatar, state.rest, state.registered, signals)
     other = TrainingState.begin(config, capture, avatar, clips, still)
-    copy = Registration(config, capture, avatar, other.rest, other.registered, signals)
+    copy = Registration(config, KeptViews(capture), avatar, other.rest, other.registered, signals)
     for _ in range(LAST - 5):
         registration.fit_next()
     saved = {name: value.clone() for name, value in state.state_dict().items() if "registration." in name}
@@ -170,7 +172,7 @@ def test_the_network_learns_to_follow_maps_that_lag_behind_the_motion(registered
     state = TrainingState.begin(config, capture, small, {SEQUENCE: range(4, LAST + 1)}, [])
     state.registered = registration.maps
     signals = {SEQUENCE: small.driving_signal(capture.motions[SEQUENCE])}
-    trainer = ChunkTrainer(config, capture, state, signals, None)
+    trainer = ChunkTrainer(config, KeptViews(capture), state, signals, None)
     gradients, losses = Gradients(list(small.parameters())), []
     for step in range(60):
         set_rates(state.optimizers, schedule_at(config.schedule, 0.13 + 0.15 * step / 60))
@@ -206,7 +208,6 @@ class ThreeFrames(Registration):
 
     def __init__(self):
         self.maps = RegisteredMaps({SEQUENCE: range(3)}, 1, {SEQUENCE: frozenset()})
-        self.maps.budget_used = 0.125
         self.avatar = SimpleNamespace(unhide_covered_texels=lambda: None)
 
     def fit_next(self):
@@ -219,13 +220,29 @@ def test_workers_whose_clocks_differ_agree_on_the_time_that_registration_took(be
     registration = ThreeFrames()
 
     class Late(loop.Clock):
-        def used(self):
-            return 0.5 + registration.maps.count / 8 - behind
+        def seconds(self):
+            return 5.0 + registration.maps.count - behind
 
     class Shared(Gradients):
-        def average(self, stop, used):
-            return stop, 0.5 + registration.maps.count / 8
+        def average(self, stop, seconds):
+            return stop, 5.0 + registration.maps.count
 
-    took = loop._register(registration, Shared([]), [], Late(1.0), 0.5, lambda *_: None)
-    assert took == (False, 0.875)
-    assert registration.maps.budget_used == 0.125 + 0.375
+    limit = TimeLimit(TrainConfig().schedule, used=2.0)
+    assert not loop._register(registration, Shared([]), [], Late(), limit, 0.12, lambda *_: None)
+    assert limit.seconds == 2.0 + 8.0
+
+
+def test_frames_that_time_was_too_short_for_are_counted():
+    registration = ThreeFrames()
+    schedule = dataclasses.replace(TrainConfig().schedule, steps=1000, minutes=1.0)
+    limit = TimeLimit(schedule, network_seconds=1.0)
+    for update in range(1, 7):
+        limit.note("template", 0.1 * update)
+
+    class Slow(Gradients):
+        def average(self, stop, seconds):
+            return stop, 25.0 + registration.maps.count
+
+    assert not loop._register(registration, Slow([]), [], loop.Clock(), limit, 0.12, lambda *_: None)
+    assert registration.maps.complete
+    assert registration.maps.unregistered == 3

@@ -95,3 +95,28 @@ def test_a_loaded_avatar_is_the_trained_one(trained):
     assert torch.equal(avatar.template.means, saved["template.means"])
     assert config.preset == "demo"
     assert len(provenance["checkpoint"]) == 16
+
+
+def test_a_limit_on_time_changes_nothing_where_there_is_time(tiny_capture, tmp_path):
+    command = ("--steps", "30", "--schedule.template-fraction", "0.2")
+    free, limited = tmp_path / "free", tmp_path / "limited"
+    main(train_arguments(tiny_capture, free, *command))
+    main(train_arguments(tiny_capture, limited, *command, "--minutes", "30"))
+    a, b = (load_file(folder / "checkpoint" / "avatar.safetensors") for folder in (free, limited))
+    assert all(torch.equal(a[key], b[key]) for key in a)
+    assert "Cut short" not in (limited / "report.html").read_text()
+
+
+def test_a_run_that_was_too_slow_for_its_limit_says_so(tiny_capture, tmp_path, caplog):
+    folder, found = tmp_path / "short", tmp_path / "short.json"
+    options = ("--steps", "100000", "--minutes", "0.05", "--json", str(found))
+    main(train_arguments(tiny_capture, folder, *options))
+    reached = json.loads(found.read_text())
+    assert 0 < reached["step"] < 10_000
+    assert reached["step"] + reached["skipped"] == pytest.approx(100_000, abs=2)
+    assert re.search(r"Cut short: \d+ of \d+ updates; .* 0.05 minutes", caplog.text)
+    at = json.loads((folder / "checkpoint" / "progress.json").read_text())
+    assert at["progress"] == 1
+    assert round(at["skipped"]) == reached["skipped"]
+    assert 1 < at["seconds"] < 6
+    assert f"Cut short: {reached['step']} of" in (folder / "report.html").read_text()

@@ -9,7 +9,7 @@ from safetensors.torch import load_file
 from dsar.cli import main
 from dsar.data.captures.formats import open_capture
 from tests.conftest import train_arguments
-from tests.unit.test_unseen_motions import add_unseen
+from tests.unseen_motions import add_unseen
 
 
 @pytest.fixture(scope="module")

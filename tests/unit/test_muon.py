@@ -10,12 +10,20 @@ def test_orthogonalised_matrix_keeps_its_singular_vectors_and_evens_out_its_sing
     for shape in ((16, 40), (40, 16), (8, 8)):
         u, _, vh = torch.linalg.svd(torch.randn(*shape, generator=generator), full_matrices=False)
         strengths = torch.logspace(0, -1.5, u.shape[1])
-        result = orthogonalize(u * strengths @ vh)
+        result = orthogonalize((u * strengths @ vh)[None])[0]
         inside = u.mT @ result @ vh.mT
         assert (inside - inside.diagonal().diag()).abs().max() < 1e-4
         assert (inside.diagonal() > 0.6).all()
         assert (inside.diagonal() < 1.3).all()
-    assert torch.equal(orthogonalize(torch.zeros(3, 4)), torch.zeros(3, 4))
+    assert torch.equal(orthogonalize(torch.zeros(1, 3, 4)), torch.zeros(1, 3, 4))
+
+
+def test_matrices_of_one_shape_do_not_mix():
+    generator = torch.Generator().manual_seed(4)
+    matrices = torch.randn(3, 6, 10, generator=generator) * torch.tensor([1e-6, 1.0, 1e3])[:, None, None]
+    together = orthogonalize(matrices)
+    for one, matrix in zip(together, matrices, strict=True):
+        torch.testing.assert_close(one, orthogonalize(matrix[None])[0])
 
 
 def test_a_weight_keeps_its_norm_however_many_steps_push_it_one_way():

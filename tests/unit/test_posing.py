@@ -8,6 +8,8 @@ from dsar.avatar.charts import Chart
 from dsar.avatar.fused_posing import pose_fused
 from dsar.avatar.posing import _nearest_quaternions_plain, nearest_quaternions, pose_gaussians
 from dsar.avatar.template import GaussianParameters
+from dsar.avatar.texel_skin import TexelSkin
+from dsar.body.skinning import blend_transforms
 from dsar.geometry.rotations import matrix_from_axis_angle, matrix_from_quaternion, nearest_rotation
 
 
@@ -50,6 +52,21 @@ def test_a_rigid_move_carries_means_covariances_and_radiance():
     assert not torch.allclose(moved.harmonics[:, 1:], rest.harmonics[:, 1:], atol=1e-2)
 
 
+def test_the_texels_skin_is_blended_as_if_all_joints_moved_every_texel():
+    generator = torch.Generator().manual_seed(3)
+    weights = torch.rand(37, 9, generator=generator)
+    weights = torch.where(torch.rand(37, 9, generator=generator) < 0.7, 0.0, weights)
+    weights[:, 4] += 0.05
+    weights = weights / weights.sum(1, keepdim=True)
+    transforms = torch.eye(4).repeat(3, 9, 1, 1)
+    transforms[..., :3, :3] = matrix_from_axis_angle(0.3 * torch.randn(3, 9, 3, generator=generator))
+    transforms[..., :3, 3] = torch.randn(3, 9, 3, generator=generator)
+    expected = blend_transforms(weights, transforms)
+    blended, rotations = TexelSkin.of_weights(weights).blend(transforms)
+    torch.testing.assert_close(blended, expected)
+    torch.testing.assert_close(rotations, nearest_quaternions(expected[..., :3]))
+
+
 @pytest.mark.parametrize("degree", [0, 2])
 def test_fused_posing_equals_sampling_activation_and_posing_in_turn(degree):
     generator = torch.Generator().manual_seed(1)
@@ -76,7 +93,9 @@ def test_fused_posing_equals_sampling_activation_and_posing_in_turn(degree):
 
     offsets = (axes * sample_bilinear(offset, sampling)[..., None, :]).sum(-1)
     expected = pose_gaussians(template.activate(offsets, sample_bilinear(appearance, sampling)), blended)
-    fused = pose_fused(template, offset, appearance, sampling, axes, blended)
+    fused = pose_fused(
+        template, offset, appearance, sampling, axes, blended, nearest_quaternions(blended[..., :3])
+    )
     fields = [[value for g in both for value in vars(g).values()] for both in (expected, fused)]
     for slow, fast in zip(*fields, strict=True):
         assert torch.allclose(slow, fast, atol=1e-6)

@@ -5,6 +5,7 @@ import torch
 
 from dsar.data.captures.formats import open_capture
 from dsar.metrics.images import mask_box
+from dsar.training.kept_views import KeptViews
 from dsar.training.targets import MARGIN, load_target
 
 
@@ -13,7 +14,7 @@ def test_targets_are_block_averages_of_premultiplied_pixels(reduction):
     capture = open_capture("embedded")
     pixels = torch.tensor(capture.image("walk", 40, 3)).float() / 255
     camera = capture.cameras[3]
-    target = load_target(capture, "walk", 40, 3, reduction)
+    target = load_target(KeptViews(capture), "walk", 40, 3, reduction)
     premultiplied = torch.cat([pixels[..., :3] * pixels[..., 3:], pixels[..., 3:]], -1).permute(2, 0, 1)
     whole = torch.nn.functional.avg_pool2d(premultiplied, reduction).permute(1, 2, 0)
     shift = (camera.K / reduction - target.camera.K)[:2, 2].round().int()

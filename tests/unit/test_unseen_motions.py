@@ -14,19 +14,9 @@ from dsar.data.captures.multiview import UNSEEN_SPLITS
 from dsar.errors import CaptureError
 from dsar.evaluation.check import check_capture, draw_overlays
 from dsar.training.scene import read_scene, scene_of_capture, write_scene
+from tests.unseen_motions import add_unseen
 
 PACKAGE = Path(__file__).parents[2] / "dsar"
-STEPS = np.array([[[100, 200, 300]], *([[[1, 0, -2]]] * 13)], np.int16)
-
-
-def add_unseen(folder: Path, **entries: dict) -> None:
-    """Add sequences to the record of a tiny capture: the motion of `turn`, a garment of one vertex."""
-    np.savez(folder / "garment.npz", run0=STEPS, run1=2 * STEPS, unit=0.001, faces=np.zeros((1, 3), np.int32))
-    record = json.loads((folder / "capture.json").read_text())
-    for name, changes in entries.items():
-        entry = {"motion": "motion/turn.npz", "images": None, "frames": 14, "garment": "garment.npz"}
-        record["sequences"][name] = {**entry, "split": "unseen_test", "labels": [], **changes}
-    (folder / "capture.json").write_text(json.dumps(record))
 
 
 @pytest.fixture

@@ -12,9 +12,9 @@ import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy import ndarray
 
 from capture.posing import Curve, Score, compose_motion
 from dsar.data.motions.files import read_motion
@@ -28,6 +28,8 @@ MOCAP = {
 }
 """Name: clip, first frame, frames, split, labels."""
 DEGREE = np.pi / 180
+Curves = dict[str, Any]
+"""Fields of a `Score`, by name."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +100,7 @@ def wander(frames: int, rng: np.random.Generator, amplitude: float, period: floa
     return amplitude * np.sum(waves, 0) / 3
 
 
-def stand_still(frames: int) -> dict[str, ndarray]:
+def stand_still(frames: int) -> Curves:
     """Return the curves of somebody who stands with the arms hanging."""
     ones = np.ones((frames, 2))
     return {
@@ -113,7 +115,7 @@ def stand_still(frames: int) -> dict[str, ndarray]:
     }
 
 
-def vary(curves: dict[str, ndarray], rng: np.random.Generator) -> None:
+def vary(curves: Curves, rng: np.random.Generator) -> None:
     """Add the slow variation of a living body to arms, trunk and pelvis, in place."""
     frames = len(curves["rise"])
     for name, amplitude in (("abduction", 0.06), ("swing", 0.10), ("elbow", 0.12), ("lean", 0.035)):
@@ -122,13 +124,13 @@ def vary(curves: dict[str, ndarray], rng: np.random.Generator) -> None:
     curves["twist"] = curves["twist"] + wander(frames, rng, 0.06)
 
 
-def hold_arms(curves: dict[str, ndarray], raised: float, bent: float) -> None:
+def hold_arms(curves: Curves, raised: float, bent: float) -> None:
     """Hold the arms out from the first frame to the last, whatever the body does."""
     curves["abduction"] = np.full_like(curves["abduction"], raised)
     curves["elbow"] = curves["elbow"] + bent
 
 
-def react_to_spin(curves: dict[str, ndarray], raised: float, bent: float) -> None:
+def react_to_spin(curves: Curves, raised: float, bent: float) -> None:
     """Raise and trail the arms with the spin's speed, and let the shoulders lead into a turn."""
     speed = np.gradient(curves["heading"]) * FPS / (2 * np.pi)
     smooth = np.convolve(np.pad(np.abs(speed), 6, mode="edge"), np.hanning(15)[1:-1] / 7, "valid")
@@ -158,7 +160,7 @@ def jump_curve(frames: int, start: int, height: float) -> Curve:
     return np.where((t > takeoff) & (t < landing), flight, ground)
 
 
-def _sway(rng: np.random.Generator) -> dict[str, ndarray]:
+def _sway(rng: np.random.Generator) -> Curves:
     frames = 100
     t = np.arange(frames)
     curves = stand_still(frames)
@@ -180,11 +182,11 @@ def _sway(rng: np.random.Generator) -> dict[str, ndarray]:
 def _spin(
     frames: int,
     spins: list[tuple[int, float, float]],
-    arms: Callable[[dict[str, ndarray], float, float], None],
+    arms: Callable[[Curves, float, float], None],
     raised: float,
     bent: float,
     rng: np.random.Generator,
-) -> dict[str, ndarray]:
+) -> Curves:
     curves = stand_still(frames)
     curves["heading"], _ = spin_curve(frames, *spins)
     arms(curves, raised * DEGREE, bent)
@@ -192,7 +194,7 @@ def _spin(
     return curves
 
 
-def _twists(rng: np.random.Generator) -> dict[str, ndarray]:
+def _twists(rng: np.random.Generator) -> Curves:
     frames = 112
     curves = stand_still(frames)
     half = np.pi
@@ -204,7 +206,7 @@ def _twists(rng: np.random.Generator) -> dict[str, ndarray]:
     return curves
 
 
-def _jumps(rng: np.random.Generator) -> dict[str, ndarray]:
+def _jumps(rng: np.random.Generator) -> Curves:
     frames = 104
     curves = stand_still(frames)
     curves["rise"] = jump_curve(frames, 6, 0.16) + jump_curve(frames, 58, 0.22)
@@ -216,7 +218,7 @@ def _jumps(rng: np.random.Generator) -> dict[str, ndarray]:
     return curves
 
 
-def _spin_and_jump(rng: np.random.Generator) -> dict[str, ndarray]:
+def _spin_and_jump(rng: np.random.Generator) -> Curves:
     frames = 118
     curves = stand_still(frames)
     curves["heading"], ends = spin_curve(frames, (6, 1.0, 1.3))
@@ -226,7 +228,7 @@ def _spin_and_jump(rng: np.random.Generator) -> dict[str, ndarray]:
     return curves
 
 
-def _far() -> tuple[dict[str, ndarray], OneToMany]:
+def _far() -> tuple[Curves, OneToMany]:
     frames = 160
     curves = stand_still(frames)
     curves["heading"], ends = spin_curve(frames, (20, 2.0, 1.5))

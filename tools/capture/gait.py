@@ -4,6 +4,8 @@ A foot stands while the pelvis passes over it and swings to its next place. Phas
 left foot strikes at whole numbers, the right one half a cycle later. Metres, radians, the stage's frame.
 """
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
@@ -24,7 +26,7 @@ def plan_steps(
     heading: Curve,
     *,
     effort: Curve,
-    lift: float = 0.05,
+    lift: Curve | float = 0.05,
     width: float = 0.085,
     stance: Curve | float = 0.62,
     middle: float = WALKING,
@@ -74,7 +76,7 @@ def _footfalls(
     return np.stack([np.interp(frame, frames, column) for column in track.T], -1)
 
 
-def swing_body(curves: dict[str, ndarray], phase: Curve, effort: Curve) -> None:
+def swing_body(curves: dict[str, Any], phase: Curve, effort: Curve) -> None:
     """Let pelvis, shoulders and arms go along with a gait, in place."""
     stride, sway = np.cos(2 * np.pi * phase), np.cos(2 * np.pi * (phase - WALKING))
     curves["heading"] = curves["heading"] - 0.09 * effort * stride

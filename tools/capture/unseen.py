@@ -7,6 +7,7 @@ Conventions as in `capture.choreography`.
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -15,6 +16,7 @@ from numpy import ndarray
 from capture.choreography import (
     DEGREE,
     FPS,
+    Curves,
     Take,
     cut_mocap,
     hold_arms,
@@ -34,10 +36,9 @@ PIECES = {
     "turn_off": ("cmu_01_03", 368, 76, VALIDATION),
     "leap": ("cmu_01_01", 346, 82, VALIDATION),
     "walk_turn": ("cmu_01_03", 532, 80, TEST),
-    "turn_and_go": ("cmu_01_03", 844, 88, TEST),
+    "turn_and_go": ("cmu_01_03", 872, 70, TEST),
 }
 """Name: clip, first frame, frames, split. All are a second or more away from what trains and from `near`."""
-Curves = dict[str, ndarray]
 
 
 def _feet(*keys: tuple[Curve, Curve, Curve], yaw: Float[ndarray, "f 2"], pitch: tuple[Curve, Curve]) -> Feet:
@@ -154,9 +155,9 @@ def _go(
     phase: Curve,
     effort: Curve,
     rng: np.random.Generator,
-    **steps: Curve | float,
+    **steps: Any,
 ) -> Curves:
-    """Complete curves by a walk ahead."""
+    """Complete curves by a walk ahead; `steps` are those of `plan_steps`."""
     curves["travel"] = _integrate(speed, heading)
     curves["feet"] = plan_steps(phase, curves["travel"], heading, effort=effort, **steps)
     curves["heading"] = heading
@@ -234,7 +235,7 @@ def _waltz(rng: np.random.Generator) -> Curves:
     path = np.stack([np.convolve(np.pad(c, 4, mode="edge"), softly, "valid") for c in box], -1)
     danced = key_curve(frames, (4, 0), (14, 1), (8 + 11 * beat, 1), (8 + 13 * beat, 0))
     phase = _to_standing(0.06 + np.cumsum(danced) / (2 * beat))
-    heading = np.convolve(np.pad(turn, 4, mode="edge"), softly, "valid")
+    heading = np.convolve(np.pad(turn, 4, mode="edge"), softly, "valid").astype(float)
     curves["travel"], curves["heading"] = path - path.mean(0), heading
     curves["feet"] = plan_steps(phase, curves["travel"], heading, effort=0.6 * danced, width=0.1)
     curves["rise"] = danced * (0.02 - 0.045 * np.cos(2 * np.pi * waltzing / 3))
