@@ -23,8 +23,7 @@ BODY = load_body()
 
 @pytest.fixture(scope="module")
 def skirt() -> ClothSimulation:
-    avatar = skirt_avatar()
-    avatar.place_prior()
+    avatar = skirt_avatar(prior="cloth")
     assert avatar.prior is not None
     return avatar.prior.garments[0].simulation(avatar.body)
 
