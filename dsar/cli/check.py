@@ -20,7 +20,7 @@ class Check(Common):
     """Read a capture, lay the body over its images, and say what is wrong with it and how to mend it."""
 
     capture: tyro.conf.Positional[str] = "embedded"
-    """A capture folder in any supported format, or `embedded`."""
+    """A capture folder in any supported format, `embedded` or `embedded-wool`."""
     body: Path | None = None
     """SMPL-X model file (.npz, .pkl), or a folder of them; default: the capture's own, or $DSAR_BODY."""
     train_frames: str | None = None

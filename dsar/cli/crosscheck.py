@@ -25,7 +25,7 @@ class Crosscheck(RunCommand):
     """Prove cameras, files and images of a run, or of a capture, by another renderer: Mitsuba."""
 
     capture: str | None = None
-    """Check a capture alone, before training: its folder, or `embedded`."""
+    """Check a capture alone, before training: its folder, `embedded` or `embedded-wool`."""
     body: Path | None = None
     """With --capture: SMPL-X model file (.npz, .pkl) or folder; default: its own, or $DSAR_BODY."""
     frame: int = 0

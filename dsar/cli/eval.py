@@ -19,7 +19,7 @@ class Eval(RunCommand):
     baselines: bool = False
     """The paradigms of other systems, likewise."""
     capture: str = "embedded"
-    """What tables are made on: a capture folder, or `embedded`."""
+    """What tables are made on: a capture folder, `embedded` or `embedded-wool`."""
     minutes: float = 10.0
     """Training of each of a table's models."""
     hours: float | None = None

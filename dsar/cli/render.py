@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal
 from dsar.cli.camera_selection import CameraSelection
 from dsar.cli.drive_command import DriveCommand, DrivenAvatar
 from dsar.cli.expected_inputs import check_inputs, to_flag
-from dsar.config import EMBEDDED
+from dsar.config import EMBEDDED_CAPTURES
 from dsar.console import track_progress
 from dsar.errors import ConfigError
 from dsar.geometry.camera_files import cameras_to_json
@@ -238,7 +238,7 @@ class Render(DriveCommand):
         if self.mp4 is not None:
             raise ConfigError("--mp4: a farm's task has some frames, a video all of them; leave --mp4 out")
         run = Run(self.chosen_run())
-        keeps_scene = run.scene.exists() or read_config(run).capture == EMBEDDED
+        keeps_scene = run.scene.exists() or read_config(run).capture in EMBEDDED_CAPTURES
         if not keeps_scene and not (self.motion_file() and self.cameras):
             LOGGER.warning(
                 "Run %s is older and keeps no cameras and motions: the farm's machines need its capture",

@@ -18,7 +18,7 @@ class Train(Common):
     """Learn an avatar from a capture."""
 
     capture: tyro.conf.Positional[str] = "embedded"
-    """A capture folder in any supported format, or `embedded`."""
+    """A capture folder in any supported format, `embedded` or `embedded-wool`."""
     preset: Literal["demo", "small", "paper"] = "demo"
     """Settings to start from; every other flag overrides them."""
     out: Path | None = None

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, cast, get_args, get_origin, get_type_hints
 
 from dsar.config.migrations import rename_settings
-from dsar.config.settings import EMBEDDED, TrainConfig
+from dsar.config.settings import EMBEDDED_CAPTURES, TrainConfig
 from dsar.errors import ConfigError
 from dsar.text import read_json
 
@@ -76,5 +76,5 @@ def with_absolute_paths(config: TrainConfig) -> TrainConfig:
 
 
 def absolute_capture(capture: str) -> str:
-    """Return the path of a capture as it is from any folder; `embedded` stays what it is."""
-    return capture if capture == EMBEDDED else str(Path(capture).resolve())
+    """Return the path of a capture as it is from any folder; an embedded one's name stays what it is."""
+    return capture if capture in EMBEDDED_CAPTURES else str(Path(capture).resolve())

@@ -9,7 +9,8 @@ from typing import Literal
 from dsar.errors import ConfigError
 
 EMBEDDED = "embedded"
-"""Stands for the capture that comes with the package, in place of a folder."""
+EMBEDDED_CAPTURES = {EMBEDDED: "embedded", "embedded-wool": "embedded_wool"}
+"""Names that stand for the captures that come with the package, and their folders in dsar/data."""
 PRESET_NAMES = ("demo", "small", "paper")
 
 
@@ -200,7 +201,7 @@ class TrainConfig:
     """A whole run."""
 
     capture: str = EMBEDDED
-    """A capture folder, absolute once a run began, or `embedded`."""
+    """A capture folder, absolute once a run began, `embedded` or `embedded-wool`."""
     body: str | None = None
     """An SMPL-X model file, likewise; none: the capture's own, else the embedded body."""
     preset: str = "demo"

@@ -32,7 +32,7 @@ from torch import Tensor
 from dsar.avatar.avatar import Avatar
 from dsar.avatar.charts import Atlas, decode_charts, encode_charts
 from dsar.body.model import PARENTS
-from dsar.config import EMBEDDED, TrainConfig, config_from_json
+from dsar.config import EMBEDDED_CAPTURES, TrainConfig, config_from_json
 from dsar.errors import CheckpointError, ConfigError
 from dsar.text import decode_text
 from dsar.training.migrations import OLDEST_VERSION, rename_tensors
@@ -171,7 +171,9 @@ def read_config(run: Run) -> TrainConfig:
         config = config_from_json(run.config)
     except ConfigError as error:
         raise CheckpointError(str(error)) from error
-    capture = config.capture if config.capture == EMBEDDED else _located(run, config.capture, "capture")
+    capture = config.capture
+    if capture not in EMBEDDED_CAPTURES:
+        capture = _located(run, capture, "capture")
     body = None if config.body is None else _located(run, config.body, "body file")
     return dataclasses.replace(config, capture=capture, body=body)
 

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from dsar.atomic_files import atomic_write
 from dsar.body.model import JOINT_NAMES
-from dsar.config import EMBEDDED, TrainConfig
+from dsar.config import EMBEDDED_CAPTURES, TrainConfig
 from dsar.data.captures.formats import capture_of
 from dsar.data.captures.multiview import MultiViewCapture
 from dsar.errors import CheckpointError
@@ -88,7 +88,7 @@ def open_images(run: Run, config: TrainConfig) -> MultiViewCapture:
 
 
 def _is_there(config: TrainConfig) -> bool:
-    return config.capture == EMBEDDED or Path(config.capture).exists()
+    return config.capture in EMBEDDED_CAPTURES or Path(config.capture).exists()
 
 
 def _recorded(scene: Scene) -> tuple[dict[str, Any], dict[str, Tensor]]:

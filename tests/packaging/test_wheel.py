@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from dsar.config import EMBEDDED_CAPTURES
+
 REPOSITORY = Path(__file__).parents[2]
 SOURCES = {
     "dsar": REPOSITORY / "dsar",
@@ -59,8 +61,9 @@ def test_every_folder_with_modules_is_a_package(package):
 def test_wheel_carries_what_the_embedded_demo_reads(wheel):
     names = wheel.namelist()
     assert "dsar/body/data/body.npz" in names
-    assert "dsar/data/embedded/capture.json" in names
-    assert any(name.startswith("dsar/data/embedded/images/") for name in names)
+    for folder in EMBEDDED_CAPTURES.values():
+        assert f"dsar/data/{folder}/capture.json" in names
+        assert any(name.startswith(f"dsar/data/{folder}/images/") for name in names)
 
 
 def test_wheel_carries_licence_and_notice(wheel):

@@ -1,1 +1,1 @@
-"""The bake of the embedded capture: choreography, cloth, wardrobe, rendering, packing."""
+"""The bake of the embedded captures: choreography, cloth, wardrobe, rendering, packing."""

@@ -14,14 +14,35 @@ from capture.cloth import Collider, Fabric, build_struts, simulate
 from dsar.body.skinning import forward_kinematics, skin_points
 from dsar.types import Body, Motion
 
-COLUMNS, ROWS = 96, 30
-BAND_ROWS = 3
-WAIST_HEIGHT = 0.235
-"""Of the skirt's upper edge in the body's rest frame."""
-HIP_HEIGHT = 0.02
-LENGTH = 0.50
-FLARE = 2.3
-"""Hem over hip circumference."""
+
+@dataclass(frozen=True)
+class Cut:
+    """Measures of a flared skirt and of its grid; heights are in the body's rest frame."""
+
+    columns: int = 96
+    rows: int = 30
+    band_rows: int = 3
+    """Rows sewn to the waist."""
+    waist_height: float = 0.235
+    """Of the skirt's upper edge."""
+    hip_height: float = 0.02
+    length: float = 0.50
+    flare: float = 2.3
+    """Hem over hip circumference."""
+    wave: float = 0.06
+    """Slope of the irregular wave that the folds start from."""
+    lowest: float = -0.62
+    """Height below which the body does not collide."""
+    hands: bool = True
+    """Whether hands and forearms collide."""
+    painted: tuple[int, int] = (2, 3)
+    """Painted vertices per simulated one, down and around."""
+    stored: tuple[int, int] = (2, 2)
+    """Rows, counted up from the hem, and columns of which one is stored as the truth."""
+
+
+FLARED = Cut()
+"""The thin skirt of the first subject."""
 PRE_ROLL = 75
 _HANDS = range(18, 55)
 _EASE = 30
@@ -31,6 +52,7 @@ _EASE = 30
 class Skirt:
     """A skirt fitted to a body in its rest pose."""
 
+    cut: Cut
     band: Float[ndarray, "p 3"]
     """Rest positions of the rows sewn to the waist, row by row."""
     band_weights: Float[ndarray, "p j"]
@@ -43,7 +65,7 @@ class Skirt:
     @property
     def faces(self) -> Int[ndarray, "t 3"]:
         """Triangles of the closed grid, counter-clockwise seen from outside."""
-        return grid_faces(ROWS, COLUMNS)
+        return grid_faces(self.cut.rows, self.cut.columns)
 
 
 def grid_faces(rows: int, columns: int) -> Int[ndarray, "t 3"]:
@@ -54,22 +76,23 @@ def grid_faces(rows: int, columns: int) -> Int[ndarray, "t 3"]:
     return np.concatenate([np.stack([a, c, b], -1), np.stack([b, c, d], -1)]).reshape(-1, 3).astype(np.int32)
 
 
-def fit_skirt(body: Body) -> Skirt:
-    """Return the skirt cut to the waist of a body."""
+def fit_skirt(body: Body, cut: Cut = FLARED) -> Skirt:
+    """Return a skirt cut to the waist of a body."""
     vertices, weights = body.vertices.numpy().astype(float), body.weights.numpy().astype(float)
-    spacing = LENGTH / (ROWS - 1)
-    rows = [_waist_ring(vertices, WAIST_HEIGHT - spacing * row) for row in range(BAND_ROWS)]
+    spacing = cut.length / (cut.rows - 1)
+    heights = cut.waist_height - spacing * np.arange(cut.band_rows)
+    rows = [_waist_ring(vertices, height, cut.columns) for height in heights]
     band = np.concatenate(rows)
     torso = np.abs(vertices[:, 0]) < 0.24
     distance = np.linalg.norm(band[:, None] - vertices[None, torso], axis=-1)
     near = np.exp(-0.5 * (distance / 0.03) ** 2) + 1e-12
     band_weights = near @ weights[torso]
     circumference = _perimeter(rows[0])
-    turn = (FLARE * _perimeter(_section(vertices, HIP_HEIGHT, 0.0)) - circumference) / LENGTH
-    radius = circumference / turn + spacing * np.arange(ROWS)
-    start = turn * np.arange(COLUMNS) / COLUMNS
+    turn = (cut.flare * _perimeter(_section(vertices, cut.hip_height, 0.0)) - circumference) / cut.length
+    radius = circumference / turn + spacing * np.arange(cut.rows)
+    start = turn * np.arange(cut.columns) / cut.columns
     pattern = np.stack(np.broadcast_arrays(radius[:, None], start[None]), -1)
-    return Skirt(band, band_weights / band_weights.sum(1, keepdims=True), pattern, turn)
+    return Skirt(cut, band, band_weights / band_weights.sum(1, keepdims=True), pattern, turn)
 
 
 def _section(vertices: Float[ndarray, "v 3"], height: float, gap: float) -> Float[ndarray, "n 2"]:
@@ -92,18 +115,18 @@ def _perimeter(outline: Float[ndarray, "n d"]) -> float:
     return float(np.linalg.norm(np.roll(outline, -1, 0) - outline, axis=1).sum())
 
 
-def _waist_ring(vertices: Float[ndarray, "v 3"], height: float) -> Float[ndarray, "c 3"]:
+def _waist_ring(vertices: Float[ndarray, "v 3"], height: float, count: int) -> Float[ndarray, "c 3"]:
     """Return the band's points at a height, evenly spaced and just off the skin."""
     outline = _section(vertices, height, 0.012)
     closed = np.concatenate([outline, outline[:1]])
     steps = np.linalg.norm(np.diff(closed, axis=0), axis=1)
     travelled = np.concatenate([[0.0], np.cumsum(steps)])
-    target = travelled[-1] * np.arange(COLUMNS) / COLUMNS
+    target = travelled[-1] * np.arange(count) / count
     even = np.stack([np.interp(target, travelled, closed[:, k]) for k in range(2)], -1)
-    return np.stack([even[:, 0], np.full(COLUMNS, height), even[:, 1]], -1)
+    return np.stack([even[:, 0], np.full(count, height), even[:, 1]], -1)
 
 
-def prepend_pre_roll(motion: Motion) -> Motion:
+def prepend_pre_roll(motion: Motion, frames: int = PRE_ROLL) -> Motion:
     """Return the motion after an unrecorded rest: eased into from a plain stance, then held still."""
     still = torch.zeros_like(motion.rotations[:1])
     still[:, 0] = motion.rotations[0, 0]
@@ -111,8 +134,8 @@ def prepend_pre_roll(motion: Motion) -> Motion:
     ease = torch.linspace(0, 1, _EASE)[:, None, None]
     ease = ease * ease * (3 - 2 * ease)
     lead = still + ease * (motion.rotations[:1] - still)
-    held = motion.rotations[:1].expand(PRE_ROLL - _EASE, -1, -1)
-    translations = motion.translations[:1].expand(PRE_ROLL, -1)
+    held = motion.rotations[:1].expand(frames - _EASE, -1, -1)
+    translations = motion.translations[:1].expand(frames, -1)
     return Motion(
         torch.cat([lead, held, motion.rotations]),
         torch.cat([translations, motion.translations]),
@@ -155,48 +178,56 @@ def drape(
         disturbance: Peak speed in m/s of a wind that blows during the pre-roll only: a second true run.
     """
     rolled = prepend_pre_roll(motion)
-    collider = _build_collider(body, rolled)
+    collider = build_collider(body, rolled, skirt.cut)
     anchors = pose_points(body, rolled, skirt.band, skirt.band_weights).astype(float)
-    start = _hang(skirt, anchors[0], seed)
+    start = hang(skirt, anchors[0], seed)
     frames = len(rolled)
     blow = np.zeros((frames, 3))
     gust = np.sin(np.linspace(0, np.pi, PRE_ROLL - 25)) * disturbance
     blow[: PRE_ROLL - 25] = gust[:, None] * np.array([0.8, 0.0, 0.6])
     struts = build_struts(skirt.pattern, skirt.turn, fabric)
-    run = simulate(start, anchors, struts, (ROWS, COLUMNS), collider, fabric, motion.fps, blow)
+    shape = (skirt.cut.rows, skirt.cut.columns)
+    run = simulate(start, anchors, struts, shape, collider, fabric, motion.fps, blow)
     return np.stack([x for i, x in enumerate(run) if i >= PRE_ROLL]).astype(np.float32)
 
 
-def _hang(skirt: Skirt, band: Float[ndarray, "p 3"], seed: int) -> Float[ndarray, "n 3"]:
+def hang(skirt: Skirt, band: Float[ndarray, "p 3"], seed: int) -> Float[ndarray, "n 3"]:
     """Return a cone below the band with the cut's own slope and a slight irregular wave."""
     rng = np.random.default_rng(seed)
-    rings = band.reshape(BAND_ROWS, COLUMNS, 3)
+    cut = skirt.cut
+    rings = band.reshape(cut.band_rows, cut.columns, 3)
     last = rings[-1]
     outward = last - last.mean(0)
     outward[:, 1] = 0
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
-    angle = 2 * np.pi * np.arange(COLUMNS) / COLUMNS
+    angle = 2 * np.pi * np.arange(cut.columns) / cut.columns
     waves = [rng.uniform(0.5, 1) * np.cos(n * angle + rng.uniform(0, 2 * np.pi)) for n in (5, 7, 8, 11)]
     wave = np.sum(waves, 0)
     slope = skirt.turn / (2 * np.pi)
-    drop = LENGTH / (ROWS - 1) * np.arange(1, ROWS - BAND_ROWS + 1)[:, None, None]
-    lateral = outward * (slope + 0.06 * wave[:, None])
+    drop = cut.length / (cut.rows - 1) * np.arange(1, cut.rows - cut.band_rows + 1)[:, None, None]
+    lateral = outward * (slope + cut.wave * wave[:, None])
     vertical = np.array([0.0, -np.sqrt(1 - slope**2), 0.0])
     return np.concatenate([band, (last + drop * (lateral + vertical)).reshape(-1, 3)])
 
 
-def _build_collider(body: Body, motion: Motion) -> Collider:
+def build_collider(body: Body, motion: Motion, cut: Cut) -> Collider:
     """Return the trunk and legs and arms below the elbow as collision geometry over time."""
+    posed, faces = build_collider_mesh(body, motion, cut)
+    normals = vertex_normals(posed, faces)
+    return Collider(posed.astype(float), normals.astype(float), _neighbours(faces, posed.shape[1]))
+
+
+def build_collider_mesh(
+    body: Body, motion: Motion, cut: Cut
+) -> tuple[Float[ndarray, "f v 3"], Int[ndarray, "t 3"]]:
+    """Return the vertices over time of what the skirt can touch, world metres, and their triangles."""
     vertices, weights, faces = body.vertices.numpy(), body.weights.numpy(), body.faces.numpy()
-    lower = (vertices[:, 1] < WAIST_HEIGHT + 0.12) & (vertices[:, 1] > -0.62)
+    lower = (vertices[:, 1] < cut.waist_height + 0.12) & (vertices[:, 1] > cut.lowest)
     hands = weights[:, list(_HANDS)].sum(1) > 0.5
-    keep = lower | hands
+    keep = lower | hands if cut.hands else lower
     index = np.cumsum(keep) - 1
     used = faces[keep[faces].all(1)]
-    local = index[used]
-    posed = pose_points(body, motion, vertices[keep], weights[keep])
-    normals = vertex_normals(posed, local)
-    return Collider(posed.astype(float), normals.astype(float), _neighbours(local, int(keep.sum())))
+    return pose_points(body, motion, vertices[keep], weights[keep]), index[used]
 
 
 def _neighbours(faces: Int[ndarray, "t 3"], count: int) -> Int[ndarray, "v k"]:

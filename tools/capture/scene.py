@@ -7,17 +7,15 @@ import torch
 from jaxtyping import Float, UInt8
 from numpy import ndarray
 
-from capture.garment import COLUMNS, ROWS, Skirt, grid_faces, vertex_normals
-from capture.prints import paint_skirt
+from capture.garment import Cut, Skirt, grid_faces, vertex_normals
 from capture.shading import Lighting, Stage
+from capture.subjects import Paint
 from capture.wardrobe import Layer
 from dsar.body.skinning import skin_points
 from dsar.geometry.cameras import look_at
 from dsar.types import Camera
 
 WIDTH, HEIGHT = 192, 256
-FINE_ROWS, FINE_COLUMNS = 2, 3
-"""Painted vertices of the skirt per simulated one, down and around."""
 # azimuth in degrees from the person's front, height and distance in metres, focal length and
 # principal-point shift as shares of the image height and size.
 _RIG = (
@@ -54,15 +52,18 @@ class Upsampling:
 
     def apply(self, values: Float[ndarray, "n k"]) -> Float[ndarray, "m k"]:
         """Return values on the painted grid, row by row."""
-        grid = values.reshape(ROWS, COLUMNS, -1)
+        grid = values.reshape(self.rows.shape[1], self.columns.shape[1], -1)
         return np.einsum("Rr,rck,Cc->RCk", self.rows, grid, self.columns, optimize=True).reshape(
             -1, grid.shape[-1]
         )
 
 
-def build_upsampling() -> Upsampling:
+def build_upsampling(cut: Cut) -> Upsampling:
     """Return Catmull-Rom interpolation, closed around and linearly continued at the waist and the hem."""
-    return Upsampling(_cubic(FINE_ROWS, ROWS, closed=False), _cubic(FINE_COLUMNS, COLUMNS, closed=True))
+    fine_rows, fine_columns = cut.painted
+    return Upsampling(
+        _cubic(fine_rows, cut.rows, closed=False), _cubic(fine_columns, cut.columns, closed=True)
+    )
 
 
 def _cubic(factor: int, coarse: int, *, closed: bool) -> Float[ndarray, "f c"]:
@@ -98,24 +99,26 @@ def _cubic(factor: int, coarse: int, *, closed: bool) -> Float[ndarray, "f c"]:
 class DressedPerson:
     """Everything that is in front of the cameras."""
 
-    def __init__(self, layers: list[Layer], skirt: Skirt, lighting: Lighting, seed: int) -> None:
+    def __init__(
+        self, layers: list[Layer], skirt: Skirt, paint: Paint, lighting: Lighting, seed: int
+    ) -> None:
         """Join the body's layers and the skirt into one mesh and paint the skirt."""
         offsets = np.cumsum([0, *(len(layer.vertices) for layer in layers)])
         self._rest = torch.from_numpy(np.concatenate([layer.vertices for layer in layers])).float()
         self._weights = torch.from_numpy(np.concatenate([layer.weights for layer in layers])).float()
         self._faces = np.concatenate([f.faces + o for f, o in zip(layers, offsets[:-1], strict=True)])
-        self._upsampling = build_upsampling()
+        self._upsampling = build_upsampling(skirt.cut)
         rows, columns = len(self._upsampling.rows), len(self._upsampling.columns)
         radius = np.repeat(self._upsampling.rows @ skirt.pattern[:, 0, 0], columns)
         angle = np.tile(
             np.interp(
-                np.arange(columns) / FINE_COLUMNS,
-                np.arange(COLUMNS + 1),
+                np.arange(columns) / skirt.cut.painted[1],
+                np.arange(skirt.cut.columns + 1),
                 [*skirt.pattern[0, :, 1], skirt.turn],
             ),
             rows,
         )
-        albedo = [layer.albedo for layer in layers] + [paint_skirt(radius, angle, skirt.turn, seed)]
+        albedo = [layer.albedo for layer in layers] + [paint(radius, angle, skirt.turn, seed)]
         faces = np.concatenate([self._faces, grid_faces(rows, columns) + offsets[-1]])
         self._skirt_faces = skirt.faces
         self._stage = Stage(faces, np.concatenate(albedo), lighting)

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from dsar.config import TrainConfig
+from dsar.config import EMBEDDED, EMBEDDED_CAPTURES, TrainConfig
 from dsar.data.captures.avatarrex import (
     PARAMETERS,
     actorshq_calibration,
@@ -18,8 +18,9 @@ from dsar.data.captures.takes import OpenOptions
 from dsar.data.folders import find_file
 from dsar.errors import CaptureError
 
-EMBEDDED_CAPTURE = Path(__file__).parents[1] / "embedded"
-"""The simulated capture that comes with the package."""
+_DATA = Path(__file__).parents[1]
+EMBEDDED_CAPTURE = _DATA / EMBEDDED_CAPTURES[EMBEDDED]
+"""The first of the simulated captures that come with the package."""
 
 
 def _open_native(root: Path, options: OpenOptions) -> MultiViewCapture:
@@ -49,7 +50,7 @@ FORMATS: dict[str, tuple[Callable[[Path], bool], Callable[[Path, OpenOptions], M
 
 
 def open_capture(
-    source: str | Path = "embedded",
+    source: str | Path = EMBEDDED,
     *,
     body: str | Path | None = None,
     train_frames: str | None = None,
@@ -58,8 +59,8 @@ def open_capture(
     """Return a capture, checked for completeness.
 
     Args:
-        source: A capture folder in any format of `FORMATS`, or `embedded` for the one that comes with the
-            package.
+        source: A capture folder in any format of `FORMATS`, `embedded` or `embedded-wool` for those that
+            come with the package.
         body: A body-model file instead of the capture's own, or a folder of SMPLX_<GENDER> files. Without
             one, captures in foreign formats take $DSAR_BODY.
         train_frames: Frames that train, such as 0-239: of a capture's single take, or of each training one.
@@ -70,10 +71,12 @@ def open_capture(
         MotionError: Its motion is.
         BodyError: The body file is.
     """
-    root = EMBEDDED_CAPTURE if source == "embedded" else Path(source).expanduser().resolve()
+    embedded = EMBEDDED_CAPTURES.get(str(source))
+    root = _DATA / embedded if embedded else Path(source).expanduser().resolve()
     if not root.is_dir():
         found = "a file" if root.exists() else "nothing"
-        raise CaptureError(f"capture {root}: expected the folder of a capture, or `embedded`, found {found}")
+        names = " or ".join(f"`{name}`" for name in EMBEDDED_CAPTURES)
+        raise CaptureError(f"capture {root}: expected the folder of a capture, {names}, found {found}")
     options = OpenOptions(None if body is None else Path(body), train_frames, test_frames)
     for is_format, open_format in FORMATS.values():
         if is_format(root):

@@ -62,7 +62,7 @@ class Study:
     minutes: float
     """Budget of each model's training."""
     capture: str = "embedded"
-    """A capture folder, or `embedded`."""
+    """A capture folder, `embedded` or `embedded-wool`."""
     preset: str = "demo"
     """What the settings of a row start from."""
     cases: Mapping[str, Case] = field(default_factory=lambda: CASES)
