@@ -25,11 +25,11 @@ from dsar.training.registered_maps import RegisteredMaps
 
 LOGGER = logging.getLogger(__name__)
 
-GENERATIONS, POPULATION = 14, 12
+GENERATIONS, POPULATION = 10, 12
 """Of the search (CMA-ES, Hansen 2016)."""
 SPREAD = 0.5
 """First standard deviation of the constants' logarithms."""
-USUAL = 0.004
+USUAL = 0.01
 """Weight of the squared distance of the logarithms from the usual constants."""
 FARTHEST = 0.3
 """Metres of error above which a map counts as lost rather than as wrong."""
