@@ -105,14 +105,14 @@ def measure(seconds: float) -> dict:
         name: per_frame(timing, frames)
         for (name, (_, frames)), timing in zip(runs.items(), timings, strict=True)
     }
-    stages = time_rollout(avatar, capture, SEQUENCE).median
+    stages = time_rollout(avatar, capture, SEQUENCE).ms
     frame = sum(stages.values())
     solver, prior = rows["solver"]["median_ms"], rows["prior"]["median_ms"]
     return {
         "sequence": SEQUENCE,
         "frames": len(signal),
         "rows": rows,
-        "frame_ms": stages | {"total": frame},
+        "frame_ms": {**stages, "total": frame},
         "ratios": {"twin": rows["twin"]["median_ms"] / solver, "share_of_frame": prior / frame},
     }
 
