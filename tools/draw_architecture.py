@@ -40,7 +40,8 @@ BOXES = {
     "exr": (7.6, 0.5, 2.0, DELIVERY, "EXR, PNG, MP4", "", "dsar_render"),
 }  # fmt: skip
 ARROWS = (
-    ("motion", "signal"), ("motion", "cloth"), ("cloth", "signal"), ("signal", "maps"), ("maps", "encoder"), ("encoder", "aggregation"),
+    ("motion", "signal"), ("motion", "cloth"), ("cloth", "signal"), ("signal", "maps"),
+    ("maps", "encoder"), ("encoder", "aggregation"),
     ("aggregation", "bank"), ("bank", "decoder"), ("decoder", "template"), ("template", "posing"),
     ("posing", "gaussians"), ("gaussians", "raster"), ("raster", "losses"), ("capture", "losses"),
     ("gaussians", "sequence"), ("sequence", "usd"), ("sequence", "exr"),
