@@ -2,8 +2,9 @@
 
     python benchmarks/prior.py [--quick] [--json FILE]
 
-On one core, at the demo's size, for the embedded capture's person in one motion. `prior` is all that a driving
-signal costs with it: body and home of every frame, settling before the first, solver, and the way to the control points. `solver` is the compiled solver alone, `twin` the same steps in plain NumPy
+On one core, at the demo's size, for the embedded capture's person in one motion. `prior` is all that a
+driving signal costs with it: body and home of every frame, settling before the first, solver, and the way
+to the control points. `solver` is the compiled solver alone, `twin` the same steps in plain NumPy
 (`dsar.dynamics.reference`). `frame` is one frame of a rollout with everything, the prior included.
 """
 
