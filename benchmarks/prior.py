@@ -2,8 +2,8 @@
 
     python benchmarks/prior.py [--quick] [--json FILE]
 
-On one core, at the demo's size, for the embedded capture's person in a motion of the capture. `prior` is all
-that a driving signal costs with it: body and home of every frame, settling before the first, solver, and the way
+On one core, at the demo's size, for the embedded capture's person in one motion. `prior` is all that a
+driving signal costs with it: body and home of every frame, settling before the first, solver, and the way
 to the control points. `solver` is the compiled solver alone, `twin` the same steps in plain NumPy
 (`dsar.dynamics.reference`). `frame` is one frame of a rollout with everything, the prior included.
 """
@@ -105,14 +105,14 @@ def measure(seconds: float) -> dict:
         name: per_frame(timing, frames)
         for (name, (_, frames)), timing in zip(runs.items(), timings, strict=True)
     }
-    stages = time_rollout(avatar, capture, SEQUENCE).median
+    stages = time_rollout(avatar, capture, SEQUENCE).ms
     frame = sum(stages.values())
     solver, prior = rows["solver"]["median_ms"], rows["prior"]["median_ms"]
     return {
         "sequence": SEQUENCE,
         "frames": len(signal),
         "rows": rows,
-        "frame_ms": stages | {"total": frame},
+        "frame_ms": {**stages, "total": frame},
         "ratios": {"twin": rows["twin"]["median_ms"] / solver, "share_of_frame": prior / frame},
     }
 

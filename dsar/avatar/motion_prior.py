@@ -69,7 +69,6 @@ class GarmentPrior(nn.Module):
         self.register_buffer("hanging", torch.zeros(GRID[0] * GRID[1], 3))
         self.register_buffer("constants", torch.from_numpy(ClothConstants().to_vector()))
         self.register_buffer("trust", torch.zeros(GRID[0]))
-        self._collider: BodyCollider | None = None
 
     @property
     def sampling(self) -> TubeSampling:
@@ -83,17 +82,15 @@ class GarmentPrior(nn.Module):
 
     def place(self, positions: Float[Tensor, "n 3"], weights: Float[Tensor, "n j"]) -> None:
         """Set the rest shape and the skin weights from all texels of the chart, row by row."""
-        self._collider = None
         self.rest.copy_(coarsen_tube(positions.unflatten(0, self.size), *GRID))
         blended = coarsen_tube(weights.unflatten(0, self.size), *GRID)
         self.weights.copy_(blended / blended.sum(-1, keepdim=True))
 
     def simulation(self, body: Body) -> ClothSimulation:
         """Return the simulation of the garment on a body."""
-        if self._collider is None:
-            heights = self.rest[..., 1]
-            self._collider = BodyCollider(body, float(heights.max()), float(heights.min()))
-        return ClothSimulation(self._collider, self.rest, self.weights)
+        heights = self.rest[..., 1]
+        collider = BodyCollider(body, float(heights.max()), float(heights.min()))
+        return ClothSimulation(collider, self.rest, self.weights)
 
     @property
     def fabric_constants(self) -> ClothConstants:

@@ -1,13 +1,14 @@
 """The solver in plain NumPy and double precision, to be read as the method: the slow twin of `solver`.
 
-Extended position-based dynamics in small steps, each with one Gauss-Seidel sweep (Macklin et al. 2019): forces
-change velocities, velocities move points, constraints move them back, and velocities are what is left.
+Extended position-based dynamics in small steps, each with one Gauss-Seidel sweep (Macklin et al. 2019):
+forces change velocities, velocities move points, constraints move them back, and velocities are what is left.
 
 World: metres, seconds, Y up.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -57,7 +58,7 @@ class ReferenceCloth:
     ) -> Float64[ndarray, "frames n 3"]:
         """Go through all frames but the first, in so many steps each; return the points, metres."""
         frames = []
-        for before, after in zip(moments[:-1], moments[1:], strict=True):
+        for before, after in pairwise(moments):
             for step in range(steps):
                 self._step(before, after, step, steps, 1 / (fps * steps))
             frames.append(self.points.copy())

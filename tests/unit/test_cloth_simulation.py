@@ -1,4 +1,4 @@
-"""A garment's simulation on the body: in parts, over time, across cuts and rates; its grid and its collider."""
+"""A garment's simulation on the body: in parts, across cuts and rates; its grid and its collider."""
 
 import dataclasses
 
@@ -232,7 +232,7 @@ def test_the_collider_is_a_thin_skin_with_outward_normals_and_without_arms(colli
 
 
 def walk(skirt, transforms, fabric):
-    """Yield cloth's points in the frames of a motion, the walk's nearest body points, and the body's points."""
+    """Yield the cloth's state in each frame of a motion, the body's points and their normals."""
     stage = skirt.stage(transforms)
     state = skirt.begin(stage, fabric, FPS)
     for frame in range(len(transforms) - 1):

@@ -96,7 +96,8 @@ def flags_of(settings: dict) -> list[str]:
 def test_old_flags_go_on_working_and_say_the_new_names(caplog):
     old = json.loads(OLD.read_text())
     with caplog.at_level(logging.WARNING):
-        command = parse(["train", "--preset", "small", "--seed", "7", *flags_of(old), "--model.prior", "none"])
+        later = ["--model.prior", "none"]
+        command = parse(["train", "--preset", "small", "--seed", "7", *flags_of(old), *later])
     assert isinstance(command, Train)
     assert command.config() == config_from_json(OLD)
     lines = [record.getMessage() for record in caplog.records]
