@@ -13,7 +13,7 @@ from dsar.dynamics.cloth import ClothConstants, Constraints, build_constraints
 from dsar.dynamics.collider import BodyCollider
 from dsar.dynamics.solver import simulate
 
-STEPS_PER_SECOND = 150
+STEPS_PER_SECOND = 240
 """Steps of the solver; a frame takes a whole number of them, and at least one."""
 SETTLING_SECONDS = 1.5
 """Time for which the cloth hangs in a motion's first pose before the motion begins."""

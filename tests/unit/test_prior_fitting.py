@@ -87,9 +87,6 @@ def found(made) -> Avatar:
     return fitted(made)
 
 
-@pytest.mark.xfail(
-    reason="a short search returns its mean, which may explain the maps worse than usual cloth"
-)
 def test_the_cloth_of_simulated_maps_is_found_and_trusted(made, found):
     usual = fitted(made, frames=0)
     assert torch.equal(garment_of(usual).constants, torch.from_numpy(ClothConstants().to_vector()))
