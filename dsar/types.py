@@ -12,7 +12,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 
@@ -325,4 +325,8 @@ class Capture(Protocol):
 
     def image(self, sequence: str, frame: int, camera: int) -> UInt8[np.ndarray, "h w 4"]:
         """Return one image: straight (not premultiplied) sRGB and the mask as alpha."""
+        ...
+
+    def garment_mask(self, sequence: str, frame: int, camera: int) -> Bool[np.ndarray, "h w"] | None:
+        """Return where an image shows loose garments, by the capture's own labels; None without any."""
         ...

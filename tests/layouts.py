@@ -220,11 +220,18 @@ def _write_scans(capture, motion, take, frames, turn):
             "uvs": np.stack([np.full_like(v, 0.5), v], 1),
         }
         _dump(take / "Meshes_pkl" / f"mesh-f{label}.pkl", mesh)
+        _dump(take / "Semantic" / "labels" / f"label-f{label}.pkl", {"scan_labels": scan_labels(body)})
         # Row 0 of the texture is v = 0: the feet are red, the head is blue.
         ramp = np.linspace(0, 255, 64).round().astype(np.uint8)
         texture = np.zeros((64, 64, 3), np.uint8)
         texture[..., 0], texture[..., 2] = ramp[::-1, None], ramp[:, None]
         _dump(take / "Meshes_pkl" / f"atlas-f{label}.pkl", texture)
+
+
+def scan_labels(body):
+    """What a scan of the body is labelled as: lower garment between the knees and the hips, else skin."""
+    height, joints = body.vertices[:, 1], body.joints[:, 1]
+    return np.where((height > joints[4]) & (height < joints[0]), 4, 0)
 
 
 def _dump(path: Path, content) -> None:

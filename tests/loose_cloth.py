@@ -20,8 +20,11 @@ FPS, ROWS, COLUMNS = 30.0, 8, 32
 _UNIT = 5e-5
 
 
-def skirt_avatar(axes: str = "surface") -> Avatar:
-    """Return an untrained avatar, whose network moves nothing, with a tube around its hips."""
+def skirt_avatar(axes: str = "surface", prior: str = "none") -> Avatar:
+    """Return an untrained avatar, whose network moves nothing, with a tube around its hips.
+
+    With a motion prior, its rest shape is in place and it is trusted fully.
+    """
     body = load_body()
     azimuth = (torch.arange(COLUMNS) + 0.5) / COLUMNS * 2 * torch.pi
     out = torch.stack([azimuth.sin(), torch.zeros(COLUMNS), azimuth.cos()], -1).repeat(ROWS, 1, 1)
@@ -37,10 +40,13 @@ def skirt_avatar(axes: str = "surface") -> Avatar:
         tangents=tube_tangents(positions.unflatten(0, (ROWS, COLUMNS))),
     )
     torch.manual_seed(0)
-    model = ModelConfig(channels=(4, 8), heads=2, window=3, memory=2, upsample=4, axes=axes)
+    model = ModelConfig(channels=(4, 8), heads=2, window=3, memory=2, upsample=4, axes=axes, prior=prior)
     avatar = Avatar(body, Atlas.stack([body_chart(body, COLUMNS), skirt]), model, FPS).eval()
     with torch.no_grad():
         avatar.template.means += 0.004 * torch.randn(avatar.template.means.shape)
+    avatar.place_prior()
+    for garment in avatar.prior.garments if avatar.prior is not None else ():
+        garment.trust.fill_(1.0)
     return avatar
 
 

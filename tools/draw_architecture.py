@@ -22,6 +22,7 @@ HEIGHT = 1.0
 BOXES = {
     # name: (x, y, width, colour, title, equations, where)
     "motion": (0.1, 4.6, 1.9, INPUT, "Motion", "", "data/motions"),
+    "cloth": (0.1, 2.5, 1.9, INPUT, "Motion prior", "", "dynamics/solver.py"),
     "signal": (2.5, 4.6, 2.0, INPUT, "Driving signal", "", "avatar/driving.py"),
     "maps": (5.0, 4.6, 2.0, INPUT, "Input maps", "equations 4, 6", "avatar/input_maps.py"),
     "encoder": (7.6, 4.6, 2.0, NETWORK, "Encoder", "equation 5", "network/encoder.py"),
@@ -39,7 +40,8 @@ BOXES = {
     "exr": (7.6, 0.5, 2.0, DELIVERY, "EXR, PNG, MP4", "", "dsar_render"),
 }  # fmt: skip
 ARROWS = (
-    ("motion", "signal"), ("signal", "maps"), ("maps", "encoder"), ("encoder", "aggregation"),
+    ("motion", "signal"), ("motion", "cloth"), ("cloth", "signal"), ("signal", "maps"),
+    ("maps", "encoder"), ("encoder", "aggregation"),
     ("aggregation", "bank"), ("bank", "decoder"), ("decoder", "template"), ("template", "posing"),
     ("posing", "gaussians"), ("gaussians", "raster"), ("raster", "losses"), ("capture", "losses"),
     ("gaussians", "sequence"), ("sequence", "usd"), ("sequence", "exr"),

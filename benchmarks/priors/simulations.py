@@ -166,7 +166,8 @@ class SimulatedGarment:
         for _ in range(generations):
             tried = search.ask()
             search.tell(tried, [loss(each) for each in tried])
-        return constants_at(search.result.xfavorite)
+        usual = np.zeros_like(search.result.xfavorite)
+        return constants_at(min(usual, search.result.xfavorite, key=loss))
 
 
 @contextlib.contextmanager

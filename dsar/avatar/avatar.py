@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Collection, Sequence
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 
 from dsar.avatar.bilinear import sample_bilinear
@@ -25,9 +25,14 @@ from dsar.avatar.texel_skin import TexelSkin
 from dsar.body.model import PARENTS
 from dsar.body.skinning import blend_transforms
 from dsar.config import AtlasConfig, ModelConfig
+from dsar.geometry.harmonics import dc_from_color
 from dsar.network import STREAMS, NetworkOutput, NetworkState, Stream, build_network
 from dsar.types import Body, Capture, Gaussians, Motion
 
+BORDER = 0.05
+"""Metres from a garment within which bare skin may carry its paint."""
+STRAYED = 0.02
+"""Metres from its texel from which on a Gaussian of bare skin is none any more."""
 GARMENT_FRAMES = 12
 """Rest frames whose masks shape the garment's chart."""
 
@@ -44,6 +49,10 @@ class Avatar(nn.Module):
     texel_frames: Tensor
     texel_tangents: Tensor
     texel_hidden: Tensor
+    texel_beneath: Tensor
+    """Texels of the body that a garment covers at times: their looks do not change any more."""
+    texel_borrowed: Tensor
+    """Those of them that were never seen without one, and have the looks of others."""
     texel_axes: Tensor
     body_joints: Tensor
 
@@ -61,6 +70,8 @@ class Avatar(nn.Module):
         self.register_buffer("texel_frames", atlas.frames)
         self.register_buffer("texel_tangents", atlas.tangents)
         self.register_buffer("texel_hidden", atlas.hidden)
+        self.register_buffer("texel_beneath", atlas.hidden.clone())
+        self.register_buffer("texel_borrowed", atlas.hidden.clone())
         axes = atlas.frames if model.axes == "surface" else torch.eye(3).expand_as(atlas.frames)
         self.register_buffer("texel_axes", axes.contiguous(), persistent=False)
         self.texel_skin = TexelSkin.of_weights(atlas.weights)
@@ -105,6 +116,12 @@ class Avatar(nn.Module):
     def num_gaussians(self) -> int:
         """Gaussians of every frame."""
         return len(self.texels)
+
+    @property
+    def borrowed_share(self) -> float | None:
+        """Share of the fixed texels that never were seen without a garment; None without any."""
+        fixed = int(self.texel_beneath.sum())
+        return int(self.texel_borrowed.sum()) / fixed if fixed else None
 
     def texels_on(self, charts: Sequence[Chart]) -> Int64[Tensor, " g"]:
         """Return which Gaussians lie on some of the charts."""
@@ -181,17 +198,55 @@ class Avatar(nn.Module):
         """Show the body beneath garments as the nearest bare texel is; called once the template is fitted.
 
         Fitted along with the garment it would be painted like it, and when the cloth lifts, that paint
-        stays behind.
+        stays behind. From then on these texels are fixed: nothing but `fix_looks` changes their looks.
         """
         if not self.texel_hidden.any():
             return
-        body = self.texels_on(self.charts[:1])
-        bare = body[~self.texel_hidden[body]]
-        points = self.texel_positions
-        source = bare[torch.cdist(points[self.texel_hidden], points[bare]).argmin(1)]
-        self.template.harmonics[self.texel_hidden] = self.template.harmonics[source]
-        self.template.opacity_logits[self.texel_hidden] = VISIBLE_LOGIT
+        self._borrow_looks(self.texel_hidden, self._bare_texels(self.texel_hidden))
         self.texel_hidden.fill_(False)
+
+    @torch.no_grad()
+    def fix_looks(
+        self, fixed: Bool[Tensor, " n"], colors: Float[Tensor, "n 3"], seen: Bool[Tensor, " n"]
+    ) -> None:
+        """Give body texels that a garment covers at times their looks, which nothing changes any more.
+
+        Those that strayed from the body, to fill in for the garment's border, come back.
+
+        Args:
+            fixed: These texels, besides those that are fixed already.
+            colors: Display-referred sRGB in [0, 1] of those that were `seen` in pixels without a garment. The
+                others take the looks of the nearest texel that was, or that no garment ever covers.
+            seen: Which fixed texels have a colour.
+        """
+        self.texel_beneath |= fixed
+        seen = seen & self.texel_beneath
+        harmonics = self.template.harmonics
+        harmonics[seen] = 0.0
+        harmonics[seen, 0] = dc_from_color(colors[seen])
+        sources = torch.cat([seen.nonzero().squeeze(1), self._bare_texels(self.texel_beneath)])
+        self._borrow_looks(self.texel_beneath & ~seen, sources)
+        strayed = (self.template.means - self.texel_positions).norm(dim=1) > STRAYED
+        self.template.reset_shapes(self.texel_beneath & strayed, self.texel_positions, self.texel_tangents)
+        logits = self.template.opacity_logits
+        logits[self.texel_beneath] = logits[self.texel_beneath].clamp_min(VISIBLE_LOGIT)
+        self.texel_borrowed.copy_(self.texel_beneath & ~seen)
+
+    def _bare_texels(self, beneath: Bool[Tensor, " n"]) -> Int64[Tensor, " m"]:
+        """Return the body's texels that are not beneath a garment, far enough from those to be unpainted."""
+        body, points = self.texels_on(self.charts[:1]), self.texel_positions
+        bare = body[~beneath[body]]
+        if not beneath.any():
+            return bare
+        apart = torch.cdist(points[bare], points[beneath]).amin(1) > BORDER
+        return bare[apart] if apart.any() else bare
+
+    def _borrow_looks(self, which: Bool[Tensor, " n"], sources: Int64[Tensor, " m"]) -> None:
+        """Give some texels the colours of the nearest of others, and let them be seen."""
+        points = self.texel_positions
+        nearest = sources[torch.cdist(points[which], points[sources]).argmin(1)]
+        self.template.harmonics[which] = self.template.harmonics[nearest]
+        self.template.opacity_logits[which] = VISIBLE_LOGIT
 
     def gather_control_points(self, offset: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b p 3"]:
         """Return a map's offsets at the control points, along their own axes, metres."""
@@ -246,10 +301,12 @@ class Avatar(nn.Module):
         sampling = self.control.sampling
         if transforms.dtype == torch.float32 and transforms.device.type == "cpu":
             bones = self.texel_skin.blend(transforms)
-            return pose_fused(self.template, offset, appearance, sampling, self.texel_axes, *bones)
+            axes, fixed = self.texel_axes, self.texel_beneath
+            return pose_fused(self.template, offset, appearance, sampling, axes, *bones, fixed)
         blended = blend_transforms(self.texel_weights, transforms)
         offsets = (self.texel_axes * sample_bilinear(offset, sampling)[..., None, :]).sum(-1)
-        return pose_gaussians(self.template.activate(offsets, sample_bilinear(appearance, sampling)), blended)
+        residuals = sample_bilinear(appearance, sampling)
+        return pose_gaussians(self.template.activate(offsets, residuals, self.texel_beneath), blended)
 
     def deformed_control_points(
         self, motion_windows: Float[Tensor, "b t j 4 4"], output: NetworkOutput

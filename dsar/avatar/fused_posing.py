@@ -8,19 +8,21 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from dsar.avatar.bilinear import BilinearSampling
 from dsar.avatar.template import SCALE_RANGE, GaussianParameters
 from dsar.geometry.harmonics import rotate_harmonics
-from dsar.raster.jit import kernel
+from dsar.raster.jit import inlined, kernel
+from dsar.raster.simd import LANES, broadcast, exp2, load, store
 from dsar.types import Gaussians
 
 _FIELDS = 5
 """Of Gaussians, in their order: those of the raw parameters, too."""
 _SMALLEST, _LARGEST = map(np.float32, SCALE_RANGE)
+_LOG2_E, _LARGEST_POWER = np.float32(1 / np.log(2)), np.float32(126)
 
 
 def pose_fused(
@@ -31,6 +33,7 @@ def pose_fused(
     axes: Float[Tensor, "n 3 3"],
     blended: Float[Tensor, "b n 3 4"],
     bone_rotations: Float[Tensor, "b n 4"],
+    fixed: Bool[Tensor, " n"],
 ) -> list[Gaussians]:
     """Return the posed Gaussians of each batch entry; float32 in main memory only.
 
@@ -42,11 +45,14 @@ def pose_fused(
         axes: columns are the offset's axes in the canonical frame.
         blended: the linear blend of bone transforms at each texel.
         bone_rotations: its nearest rotation, unit wxyz.
+        fixed: which Gaussians keep their looks, as `GaussianParameters.activate` takes them.
     """
-    values = torch.cat([offset, appearance], 1).flatten(2).transpose(1, 2)
+    # Channels fill whole registers.
+    room = offset.new_zeros(len(offset), -(3 + appearance.shape[1]) % LANES, *offset.shape[2:])
+    values = torch.cat([offset, appearance, room], 1).flatten(2).transpose(1, 2)
     fields = _Pose.apply(
         values, template.means, template.quaternions, template.log_scales, template.opacity_logits,
-        template.harmonics, *sampling, axes, blended, bone_rotations,
+        template.harmonics, *sampling, axes, fixed, blended, bone_rotations,
     )  # fmt: skip
     posed = []
     for entry, bone_rotation in enumerate(bone_rotations):
@@ -88,23 +94,23 @@ class _Pose(torch.autograd.Function):
                 values[entry], raw[1], *texels, *(array[entry] for array in per_entry),
                 *(gradient.contiguous().numpy() for gradient in arriving), v_values[entry], *v_raw,
             )  # fmt: skip
-        return *map(torch.from_numpy, (v_values, *v_raw)), None, None, None, None, None
+        return *map(torch.from_numpy, (v_values, *v_raw)), None, None, None, None, None, None
 
 
 @kernel
 def _pose(
-    values, means, quaternions, log_scales, logits, harmonics, cells, weights, axes, transforms, bones,
+    values, means, quaternions, log_scales, logits, harmonics, cells, weights, axes, fixed, transforms, bones,
     out_means, out_rotations, out_scales, out_opacities, out_harmonics,
 ):  # fmt: skip
     """Sample the residuals of every texel, add them, activate, and pose."""
     n, bands = harmonics.shape[0], harmonics.shape[1]
-    count = values.shape[1]
-    r = np.empty(count, np.float32)
+    count, flat = values.shape[1], values.reshape(-1)
+    r, powers = np.empty(count, np.float32), np.zeros(LANES, np.float32)
     for i in range(n):
-        i0, i1, i2, i3 = cells[i, 0], cells[i, 1], cells[i, 2], cells[i, 3]
-        w0, w1, w2, w3 = weights[i, 0], weights[i, 1], weights[i, 2], weights[i, 3]
-        for c in range(count):
-            r[c] = w0 * values[i0, c] + w1 * values[i1, c] + w2 * values[i2, c] + w3 * values[i3, c]
+        for c in range(0, count, LANES):
+            store(r, np.uint64(c), _sample(flat, cells[i], weights[i], count, c))
+        if fixed[i]:
+            r[3:] = 0
         x = means[i, 0] + axes[i, 0, 0] * r[0] + axes[i, 0, 1] * r[1] + axes[i, 0, 2] * r[2]
         y = means[i, 1] + axes[i, 1, 0] * r[0] + axes[i, 1, 1] * r[1] + axes[i, 1, 2] * r[2]
         z = means[i, 2] + axes[i, 2, 0] * r[0] + axes[i, 2, 1] * r[1] + axes[i, 2, 2] * r[2]
@@ -121,11 +127,18 @@ def _pose(
         out_rotations[i, 2] = aw * by - ax * bz + ay * bw + az * bx
         out_rotations[i, 3] = aw * bz + ax * by - ay * bx + az * bw
         for k in range(3):
+            powers[k] = _exponent(log_scales[i, k] + r[7 + k])
+        powers[3] = _exponent(-(logits[i] + r[10]))
+        exponents = load(powers, np.uint64(0))
+        store(powers, np.uint64(0), exp2(exponents))
+        for k in range(3):
             # Written so that NaN passes through: a value that is not finite must not look sound.
-            scale = np.exp(log_scales[i, k] + r[7 + k])
+            raw = log_scales[i, k] + r[7 + k]
+            scale = powers[k] if raw == raw else raw
             scale = _SMALLEST if scale < _SMALLEST else scale
             out_scales[i, k] = _LARGEST if scale > _LARGEST else scale
-        out_opacities[i] = np.float32(1) / (np.float32(1) + np.exp(-(logits[i] + r[10])))
+        raw = logits[i] + r[10]
+        out_opacities[i] = np.float32(1) / (np.float32(1) + powers[3]) if raw == raw else raw
         for b in range(bands):
             for k in range(3):
                 out_harmonics[i, b, k] = harmonics[i, b, k] + r[11 + 3 * b + k]
@@ -133,58 +146,76 @@ def _pose(
 
 @kernel
 def _pose_backward(
-    values, quaternions, cells, weights, axes, transforms, bones, scales, opacities,
+    values, quaternions, cells, weights, axes, fixed, transforms, bones, scales, opacities,
     v_means, v_rotations, v_scales, v_opacities, v_harmonics,
     out_values, out_means, out_quaternions, out_log_scales, out_logits, out_harmonics,
 ):  # fmt: skip
     """Add the gradients of posed Gaussians to those of raw parameters, and of the grid's cells."""
     n, bands = v_harmonics.shape[0], v_harmonics.shape[1]
-    count = values.shape[1]
-    r = np.empty(count, np.float32)
+    count, flat, out_flat = values.shape[1], values.reshape(-1), out_values.reshape(-1)
+    r, sampled = np.zeros(count, np.float32), np.empty(LANES, np.float32)
     for i in range(n):
-        i0, i1, i2, i3 = cells[i, 0], cells[i, 1], cells[i, 2], cells[i, 3]
-        w0, w1, w2, w3 = weights[i, 0], weights[i, 1], weights[i, 2], weights[i, 3]
+        store(sampled, np.uint64(0), _sample(flat, cells[i], weights[i], count, 0))
         t = transforms[i]
         gx, gy, gz = v_means[i, 0], v_means[i, 1], v_means[i, 2]
         x = t[0, 0] * gx + t[1, 0] * gy + t[2, 0] * gz
         y = t[0, 1] * gx + t[1, 1] * gy + t[2, 1] * gz
         z = t[0, 2] * gx + t[1, 2] * gy + t[2, 2] * gz
-        out_means[i, 0] += x
-        out_means[i, 1] += y
-        out_means[i, 2] += z
         for k in range(3):
             r[k] = axes[i, 0, k] * x + axes[i, 1, k] * y + axes[i, 2, k] * z
-        for c in range(3, 7):
-            r[c] = w0 * values[i0, c] + w1 * values[i1, c] + w2 * values[i2, c] + w3 * values[i3, c]
-        bw, bx = quaternions[i, 0] + r[3], quaternions[i, 1] + r[4]
-        by, bz = quaternions[i, 2] + r[5], quaternions[i, 3] + r[6]
-        inverse = np.float32(1) / max(np.sqrt(bw * bw + bx * bx + by * by + bz * bz), np.float32(1e-12))
-        bw, bx, by, bz = bw * inverse, bx * inverse, by * inverse, bz * inverse
-        # The gradient is rotated back with the conjugate of the bone's rotation.
-        aw, ax, ay, az = bones[i, 0], -bones[i, 1], -bones[i, 2], -bones[i, 3]
-        pw, px, py, pz = v_rotations[i, 0], v_rotations[i, 1], v_rotations[i, 2], v_rotations[i, 3]
-        qw = aw * pw - ax * px - ay * py - az * pz
-        qx = aw * px + ax * pw + ay * pz - az * py
-        qy = aw * py - ax * pz + ay * pw + az * px
-        qz = aw * pz + ax * py - ay * px + az * pw
-        radial = bw * qw + bx * qx + by * qy + bz * qz
-        r[3], r[4] = (qw - bw * radial) * inverse, (qx - bx * radial) * inverse
-        r[5], r[6] = (qy - by * radial) * inverse, (qz - bz * radial) * inverse
-        for k in range(3):
-            free = _SMALLEST < scales[i, k] < _LARGEST
-            r[7 + k] = v_scales[i, k] * scales[i, k] if free else np.float32(0)
-        r[10] = v_opacities[i] * opacities[i] * (np.float32(1) - opacities[i])
-        for b in range(bands):
+        if fixed[i]:
+            r[3:] = 0
+        else:
+            out_means[i, 0] += x
+            out_means[i, 1] += y
+            out_means[i, 2] += z
+            bw, bx = quaternions[i, 0] + sampled[3], quaternions[i, 1] + sampled[4]
+            by, bz = quaternions[i, 2] + sampled[5], quaternions[i, 3] + sampled[6]
+            inverse = np.float32(1) / max(np.sqrt(bw * bw + bx * bx + by * by + bz * bz), np.float32(1e-12))
+            bw, bx, by, bz = bw * inverse, bx * inverse, by * inverse, bz * inverse
+            # The gradient is rotated back with the conjugate of the bone's rotation.
+            aw, ax, ay, az = bones[i, 0], -bones[i, 1], -bones[i, 2], -bones[i, 3]
+            pw, px, py, pz = v_rotations[i, 0], v_rotations[i, 1], v_rotations[i, 2], v_rotations[i, 3]
+            qw = aw * pw - ax * px - ay * py - az * pz
+            qx = aw * px + ax * pw + ay * pz - az * py
+            qy = aw * py - ax * pz + ay * pw + az * px
+            qz = aw * pz + ax * py - ay * px + az * pw
+            radial = bw * qw + bx * qx + by * qy + bz * qz
+            r[3], r[4] = (qw - bw * radial) * inverse, (qx - bx * radial) * inverse
+            r[5], r[6] = (qy - by * radial) * inverse, (qz - bz * radial) * inverse
             for k in range(3):
-                r[11 + 3 * b + k] = v_harmonics[i, b, k]
-                out_harmonics[i, b, k] += v_harmonics[i, b, k]
-        for k in range(4):
-            out_quaternions[i, k] += r[3 + k]
-        for k in range(3):
-            out_log_scales[i, k] += r[7 + k]
-        out_logits[i] += r[10]
-        for c in range(count):
-            out_values[i0, c] += w0 * r[c]
-            out_values[i1, c] += w1 * r[c]
-            out_values[i2, c] += w2 * r[c]
-            out_values[i3, c] += w3 * r[c]
+                free = _SMALLEST < scales[i, k] < _LARGEST
+                r[7 + k] = v_scales[i, k] * scales[i, k] if free else np.float32(0)
+            r[10] = v_opacities[i] * opacities[i] * (np.float32(1) - opacities[i])
+            for b in range(bands):
+                for k in range(3):
+                    r[11 + 3 * b + k] = v_harmonics[i, b, k]
+                    out_harmonics[i, b, k] += v_harmonics[i, b, k]
+            for k in range(4):
+                out_quaternions[i, k] += r[3 + k]
+            for k in range(3):
+                out_log_scales[i, k] += r[7 + k]
+            out_logits[i] += r[10]
+        for c in range(0, count, LANES):
+            gradient = load(r, np.uint64(c))
+            for k in range(4):
+                place = np.uint64(cells[i, k]) * np.uint64(count) + np.uint64(c)
+                store(out_flat, place, load(out_flat, place) + weights[i, k] * gradient)
+
+
+@inlined
+def _sample(values, cells, weights, count, channel):
+    """Return the LANES values of a texel from a channel on, from the four cells around it."""
+    total = broadcast(np.float32(0))
+    for k in range(4):
+        place = np.uint64(cells[k]) * np.uint64(count) + np.uint64(channel)
+        total += weights[k] * load(values, place)
+    return total
+
+
+@inlined
+def _exponent(value):
+    """Return the power of 2 that is e to a value, brought into the range of `exp2`."""
+    power = value * _LOG2_E
+    power = _LARGEST_POWER if power > _LARGEST_POWER else power
+    return -_LARGEST_POWER if power < -_LARGEST_POWER else power

@@ -8,7 +8,7 @@ import logging
 import math
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from dsar.avatar.charts import ChartTexels
@@ -31,6 +31,8 @@ AZIMUTHS = 64
 """Directions sampled around the axis."""
 BELOW_HEM = 0.03
 """Metres below the hem that still count as beneath the garment: cameras above the hem do not see them."""
+PAST_HEM = 2 * SEARCH_STEP
+"""Metres by which the chart goes on below the hem that is seen."""
 _ARMS = ("collar", "shoulder", "elbow", "wrist", "index", "middle", "pinky", "ring", "thumb")
 
 
@@ -56,7 +58,7 @@ def fit_garment_chart(
         return None
     hem, waist = extent
     # The masks of all cameras agree on a little less than the cloth: its border must not be left to the legs.
-    rows = torch.linspace(waist, hem - 2 * SEARCH_STEP, size[0])
+    rows = torch.linspace(waist, hem - PAST_HEM, size[0])
     azimuths = _azimuths(size[1])
     # Near the hem the masks' border frays the hull; the cloth goes straight on there.
     radii = _resample(hull, heights, rows.clamp_min(hem + 4 * SEARCH_STEP), size[1])
@@ -80,6 +82,15 @@ def tube_tangents(positions: Float[Tensor, "r c 3"]) -> Float[Tensor, "n 3 2"]:
     return torch.stack([right, down], -1).flatten(0, 1)
 
 
+def tube_faces(rows: int, columns: int) -> Int64[Tensor, "t 3"]:
+    """Return the triangles between a tube's texels in row-major order, counter-clockwise from outside."""
+    index = torch.arange(rows * columns).unflatten(0, (rows, columns))
+    upper, lower = index[:-1], index[1:]
+    after, beneath = upper.roll(-1, 1), lower.roll(-1, 1)
+    halves = torch.stack([upper, lower, after], -1), torch.stack([after, lower, beneath], -1)
+    return torch.cat([half.reshape(-1, 3) for half in halves])
+
+
 def texels_beneath(body: Body, chart: ChartTexels, points: ChartTexels) -> Bool[Tensor, " n"]:
     """Return which texels of the body's chart lie inside a garment's tube at rest; arms never do."""
     center = body.joints[0]
@@ -91,7 +102,7 @@ def texels_beneath(body: Body, chart: ChartTexels, points: ChartTexels) -> Bool[
     column = ((azimuth + math.pi) / (2 * math.pi) * columns).long().clamp(0, columns - 1)
     inside = offset[:, [0, 2]].norm(dim=1) < tube[row, column][:, [0, 2]].norm(dim=1)
     level = (offset[:, 1] <= waist) & (offset[:, 1] >= hem - BELOW_HEM)
-    return inside & level & (points.weights[:, _arm_joints()].sum(1) < 0.5)
+    return inside & level & (points.weights[:, arm_joints()].sum(1) < 0.5)
 
 
 def hull_radii(
@@ -172,10 +183,11 @@ def diffuse_weights(body: Body, points: Float[Tensor, "n 3"], sigma: float) -> F
 
 
 def _is_arm(body: Body) -> Bool[Tensor, " v"]:
-    return body.weights[:, _arm_joints()].sum(1) > 0.5
+    return body.weights[:, arm_joints()].sum(1) > 0.5
 
 
-def _arm_joints() -> Bool[Tensor, " j"]:
+def arm_joints() -> Bool[Tensor, " j"]:
+    """Return which joints move an arm or a hand."""
     return torch.tensor([any(part in name for part in _ARMS) for name in JOINT_NAMES])
 
 

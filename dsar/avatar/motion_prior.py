@@ -69,7 +69,7 @@ class GarmentPrior(nn.Module):
         self.register_buffer("hanging", torch.zeros(GRID[0] * GRID[1], 3))
         self.register_buffer("constants", torch.from_numpy(ClothConstants().to_vector()))
         self.register_buffer("trust", torch.zeros(GRID[0]))
-        self._collider: BodyCollider | None = None
+        self._collider: tuple[tuple[float, float], BodyCollider] | None = None
 
     @property
     def sampling(self) -> TubeSampling:
@@ -83,17 +83,18 @@ class GarmentPrior(nn.Module):
 
     def place(self, positions: Float[Tensor, "n 3"], weights: Float[Tensor, "n j"]) -> None:
         """Set the rest shape and the skin weights from all texels of the chart, row by row."""
-        self._collider = None
         self.rest.copy_(coarsen_tube(positions.unflatten(0, self.size), *GRID))
         blended = coarsen_tube(weights.unflatten(0, self.size), *GRID)
         self.weights.copy_(blended / blended.sum(-1, keepdim=True))
 
     def simulation(self, body: Body) -> ClothSimulation:
         """Return the simulation of the garment on a body."""
-        if self._collider is None:
-            heights = self.rest[..., 1]
-            self._collider = BodyCollider(body, float(heights.max()), float(heights.min()))
-        return ClothSimulation(self._collider, self.rest, self.weights)
+        rest = self.rest.cpu()
+        extent = (float(rest[..., 1].max()), float(rest[..., 1].min()))
+        # Kept from motion to motion; a loaded or fitted garment may reach elsewhere.
+        if self._collider is None or self._collider[0] != extent:
+            self._collider = extent, BodyCollider(body.to(device="cpu"), *extent)
+        return ClothSimulation(self._collider[1], rest, self.weights.cpu())
 
     @property
     def fabric_constants(self) -> ClothConstants:
@@ -153,8 +154,9 @@ class MotionPrior(nn.Module):
             return transforms.new_zeros(len(transforms), len(garment.axes), CHANNELS)
         simulation = garment.simulation(body)
         fabric = simulation.fabric(garment.fabric_constants)
-        displaced = simulation.follow(transforms, fabric, fps, garment.hanging)
-        offsets = garment.along_axes(displaced - garment.hanging)
+        hanging = garment.hanging.cpu()
+        displaced = simulation.follow(transforms.cpu(), fabric, fps, hanging)
+        offsets = garment.along_axes((displaced - hanging).to(transforms))
         change = torch.cat([torch.zeros_like(offsets[:1]), offsets.diff(dim=0)]) * (fps / REFERENCE_FPS)
         return torch.cat([offsets, change], -1)
 

@@ -42,18 +42,34 @@ class GaussianParameters(nn.Module):
         harmonics[:, 0] = dc_from_color(torch.tensor([0.5, 0.5, 0.5]))
         self.harmonics = nn.Parameter(harmonics)
 
+    @torch.no_grad()
+    def reset_shapes(
+        self, which: Bool[Tensor, " n"], positions: Float[Tensor, "n 3"], tangents: Float[Tensor, "n 3 2"]
+    ) -> None:
+        """Make some Gaussians the footprints of their texels again."""
+        rotations, scales = texel_footprints(tangents[which])
+        self.means[which], self.quaternions[which] = positions[which], rotations
+        self.log_scales[which] = scales.log()
+
     def activate(
         self,
         offset: Float[Tensor, "b n 3"] | None = None,
         appearance: Float[Tensor, "b n a"] | None = None,
+        fixed: Bool[Tensor, " n"] | None = None,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """Return canonical means, rotations, scales, opacities and harmonics, batch first.
 
         Without residuals it is the template itself, in a batch of one. Residuals are added to the raw
         values: metres to means, then quaternion 4, log-scale 3, logit 1, harmonics 3k (paper equation 2).
+        Gaussians that are `fixed` move with the offset, but look as they do: no residual of theirs counts,
+        and their parameters get no gradient.
         """
-        quaternions, log_scales = self.quaternions[None], self.log_scales[None]
-        logits, harmonics, means = self.opacity_logits[None], self.harmonics[None], self.means[None]
+        raw = (self.means, self.quaternions, self.log_scales, self.opacity_logits, self.harmonics)
+        if fixed is not None:
+            raw = tuple(torch.where(_like(fixed, value), value.detach(), value) for value in raw)
+            if appearance is not None:
+                appearance = appearance.masked_fill(fixed[:, None], 0.0)
+        means, quaternions, log_scales, logits, harmonics = (value[None] for value in raw)
         if offset is not None and appearance is not None:
             quaternion, log_scale, logit, harmonic = appearance.split([4, 3, 1, appearance.shape[-1] - 8], -1)
             means = means + offset
@@ -62,6 +78,11 @@ class GaussianParameters(nn.Module):
             harmonics = harmonics + harmonic.unflatten(-1, (-1, 3))
         rotations = nn.functional.normalize(quaternions, dim=-1)
         return means, rotations, log_scales.exp().clamp(*SCALE_RANGE), logits.sigmoid(), harmonics
+
+
+def _like(flags: Bool[Tensor, " n"], values: Float[Tensor, "n *c"]) -> Bool[Tensor, "n *_"]:
+    """Return flags with as many dimensions as values."""
+    return flags.reshape(-1, *[1] * (values.ndim - 1))
 
 
 def texel_footprints(

@@ -25,7 +25,7 @@ RENAMED = {
     "schedule.clip": "schedule.max_gradient_norm",
 }
 """Old and new name of each setting, with its section."""
-ADDED = {"model.prior": "none"}
+ADDED = {"model.prior": "none", "loss.residual": 0.0}
 """Settings that came later, and the value by which runs from before go on as they were."""
 RENAMED_STAGES = {"imitation": "pretraining"}
 """Old and new name of each stage of training, as metrics.jsonl says it."""

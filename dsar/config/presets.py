@@ -36,6 +36,7 @@ PRESETS: dict[str, TrainConfig] = {
             spatial=0.0,
             shape=0.0,
             registered=0.0,
+            residual=0.0,
             temporal_scale=1.0,
             magnitude="frame",
         ),

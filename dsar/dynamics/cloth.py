@@ -12,31 +12,31 @@ from numpy import ndarray
 class ClothConstants:
     """What kind of cloth it is; compliances are of unit mass (Macklin et al. 2019)."""
 
-    drag: float = 2.0
+    drag: float = 0.8
     """Quadratic air drag along the normal, 1/m."""
-    damping: float = 0.3
+    damping: float = 0.8
     """Linear damping of the velocity, 1/s."""
-    viscosity: float = 10.0
+    viscosity: float = 24.0
     """Rate at which a point takes its neighbours' mean velocity, 1/s."""
-    friction: float = 0.6
+    friction: float = 0.54
     """Coulomb coefficient against the body."""
-    thickness: float = 0.008
+    thickness: float = 0.006
     """Distance kept from the body, metres."""
-    pull: float = 10.0
+    pull: float = 2.1
     """Stiffness of the way home, 1/s²."""
-    homing: float = 0.3
+    homing: float = 0.4
     """Damping of the velocity relative to home, 1/s."""
-    core: float = 0.7
+    core: float = 0.5
     """Share of its home's distance from the middle of its row within which no point comes."""
-    slack: float = 1.05
+    slack: float = 1.03
     """How much wider than at rest the hem is once its folds are stretched out."""
-    give: float = 1.03
+    give: float = 1.01
     """The same for the diagonals, which carry the waist's turning to the hem."""
-    shear: float = 1e-5
+    shear: float = 3.3e-6
     """Compliance of the grid's diagonals."""
-    bend: float = 3e-4
+    bend: float = 2.7e-3
     """Compliance of the two-apart struts that resist bending."""
-    fold: float = 5e-3
+    fold: float = 2.3e-2
     """Compliance of the struts a sixth of the way around that keep folds few and large."""
 
     @classmethod

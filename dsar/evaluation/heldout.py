@@ -49,6 +49,14 @@ def evaluate(
     garments = {name: measure_garment(avatar, capture, name, 2 * stride) for name in capture.splits["test"]}
     if not all(garment_ground_truth(capture, name) for name in by_sequence):
         skipped["psnr_garment"] = "the capture does not say where the garment is"
+    if any(split is not None and split.psnr_uncovered is None for split in splits.values()):
+        skipped["psnr_uncovered"] = (
+            "the avatar has no garment chart"
+            if not avatar.garments
+            else "the capture does not say where the garment is, or it never leaves the body free"
+        )
+    if avatar.borrowed_share is None:
+        skipped["borrowed"] = "no garment covers the avatar's body, or it was trained before this was kept"
     if not all(garments.values()):
         skipped["garment"] = "no simulated garment in the capture, or no garment chart in the avatar"
     if missing_unseen := unseen_missing(avatar, capture):
@@ -64,6 +72,7 @@ def evaluate(
         parameters=sum(p.numel() for p in avatar.network.parameters()),
         one_to_many=one_to_many(avatar, capture, streams=streams),
         garment=garments,
+        borrowed=avatar.borrowed_share,
         unseen=unseen,
         worst=worst_views(by_sequence, capture.splits["test"]),
         skipped=skipped,

@@ -27,7 +27,17 @@ LOGGER = logging.getLogger(__name__)
 
 _STAGES = {"template": "#9aa5b1", "pretraining": "#c77d0a", "pose": "#4c78a8", "autoregressive": "#2a7f62"}
 _METRICS = (
-    *("psnr", "psnr_box", "psnr_box_template", "psnr_garment", "ssim", "lpips", "lpips_vgg", "flip"),
+    *(
+        "psnr",
+        "psnr_box",
+        "psnr_box_template",
+        "psnr_garment",
+        "psnr_uncovered",
+        "ssim",
+        "lpips",
+        "lpips_vgg",
+        "flip",
+    ),
     *("tpsnr", "warp_error", "vmaf", "mmd"),
 )
 _PREVIEWS = (

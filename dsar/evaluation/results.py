@@ -26,6 +26,8 @@ class ViewMetrics:
     ssim: float
     psnr_garment: float | None = None
     """dB, where the garment is visible in truth."""
+    psnr_uncovered: float | None = None
+    """dB, where the body is visible in truth and a garment at rest would hide it."""
     lpips: float | None = None
     lpips_vgg: float | None = None
     flip: float | None = None
@@ -55,6 +57,7 @@ class SplitMetrics:
     psnr_box: float | None
     psnr_box_template: float | None
     psnr_garment: float | None
+    psnr_uncovered: float | None
     ssim: float | None
     lpips: float | None
     lpips_vgg: float | None
@@ -190,6 +193,9 @@ class HeldoutFigures:
     one_to_many: OneToManyFigures | None
     garment: Mapping[str, Mapping[str, GarmentFigures] | None]
     """By test sequence: of the prediction, the template, another simulation and the truth itself."""
+    borrowed: float | None
+    """Share of the body's texels beneath garments that training never saw without one, and that look as the
+    nearest that it saw; None where no garment covers any."""
     unseen: Mapping[str, UnseenFigures] | None
     """Motions that nobody trained on: `validation`, on which choices are made, and `test`, which is only
     reported; None where they cannot be measured."""

@@ -8,7 +8,7 @@ from collections.abc import Collection, Mapping
 from types import MappingProxyType
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from dsar.avatar.avatar import Avatar
@@ -18,6 +18,7 @@ from dsar.evaluation.garment_metrics import garment_mask
 from dsar.evaluation.image_metrics import ImageMetric
 from dsar.evaluation.results import ViewMetrics
 from dsar.evaluation.temporal_metrics import temporal_psnr, trace_back, warp_error
+from dsar.evaluation.uncovered import RestingGarment, psnr_uncovered, touched_pixels
 from dsar.evaluation.views import WHITE, View, render_white, true_view
 from dsar.metrics.images import mask_box, psnr, ssim
 from dsar.network import STREAMS, Stream
@@ -48,6 +49,7 @@ def evaluate_sequence(
     motion = capture.motions[sequence]
     signal = avatar.driving_signal(motion)
     garment = garment_ground_truth(capture, sequence)
+    resting = RestingGarment.of(avatar)
     rows, before = [], None
     for number, gaussians in roll_out(avatar, motion, streams=streams):
         frame = number - START_FRAME
@@ -62,6 +64,11 @@ def evaluate_sequence(
                     if inside.any():
                         in_garment = psnr(image[inside][None], truth.color[inside][None])
                         view = dataclasses.replace(view, psnr_garment=in_garment)
+                cover = true_cover(capture, garment, sequence, frame, index)
+                if cover is not None and resting is not None:
+                    at_rest = resting.silhouette(signal.transforms[frame], camera)
+                    uncovered = psnr_uncovered(image, truth, cover, at_rest)
+                    view = dataclasses.replace(view, psnr_uncovered=uncovered)
                 slow = frame % (_SLOW_EVERY * stride) == 0
                 if slow and before is not None and index in capture.cameras_with_image(sequence, frame - 1):
                     last = true_view(capture, sequence, frame - 1, index)
@@ -83,6 +90,20 @@ def garment_ground_truth(
     if not (isinstance(capture, MultiViewCapture) and capture.garment_runs(sequence)):
         return None
     return torch.from_numpy(capture.garment(sequence)), torch.from_numpy(capture.garment_faces(sequence))
+
+
+def true_cover(
+    capture: Capture,
+    garment: tuple[Float[Tensor, "f v 3"], Int64[Tensor, "t 3"]] | None,
+    sequence: str,
+    frame: int,
+    camera: int,
+) -> Bool[Tensor, "h w"] | None:
+    """Return where the true garment is in an image, by its simulation or by labels; None without either."""
+    if garment is not None:
+        return touched_pixels(garment[0][frame], garment[1], capture.cameras[camera])
+    labels = capture.garment_mask(sequence, frame, camera)
+    return None if labels is None else torch.from_numpy(labels)
 
 
 def compare(

@@ -40,6 +40,7 @@ from dsar.types import Body
 
 FORMAT_VERSION = 4
 _BODY = ("vertices", "faces", "joints", "weights", "uv", "uv_faces")
+_SINCE_LAYERS = ("texel_beneath", "texel_borrowed")
 # What a damaged or foreign file can raise on its way to what it should have been.
 _DAMAGE = (SafetensorError, ValueError, KeyError, IndexError, TypeError, AttributeError, RuntimeError)
 LOGGER = logging.getLogger(__name__)
@@ -239,6 +240,9 @@ def _avatar(tensors: dict[str, Tensor], config: TrainConfig, path: Path) -> Avat
     charts = decode_charts(tensors.pop("charts", None), height, width)
     atlas = Atlas(charts, width, tensors["texels"], *(tensors[f"texel_{name}"] for name in fields))
     avatar = Avatar(body, atlas, config.model, float(tensors.pop("fps")))
+    for name in _SINCE_LAYERS:
+        # Older avatars keep no looks.
+        tensors.setdefault(name, torch.zeros_like(tensors["texel_hidden"]))
     expected = {name: tuple(value.shape) for name, value in avatar.state_dict().items()}
     present = {name: tuple(value.shape) for name, value in tensors.items()}
     for name in sorted(expected.keys() | present.keys()):

@@ -19,7 +19,7 @@ from dsar.network import STREAMS, NetworkOutput, Stream
 from dsar.raster import rasterize, reduced_dilation
 from dsar.training.driving_maps import DrivingFrames, DrivingMaps
 from dsar.training.kept_views import KeptViews
-from dsar.training.losses import image_loss, registered_loss, spatial_loss
+from dsar.training.losses import CENTIMETRES, image_loss, registered_loss, spatial_loss
 from dsar.training.report import UpdateMetrics
 from dsar.training.rollouts import RolloutCursor
 from dsar.training.schedule import WHOLE_CLIP, ScheduleState
@@ -99,7 +99,7 @@ class ChunkTrainer:
         loss = torch.zeros(())
         for _ in range(self.config.schedule.chunk_frames):
             step = self._step(*self.state.rollouts.next_frames(rng, WHOLE_CLIP), streams=STREAMS)
-            loss = loss + self._registered_distance(step)
+            loss = loss + self._registered_distance(step) + self._residual(step)
         self._detach_state()
         return self._backward(loss, None, self.config.schedule.chunk_frames)
 
@@ -183,6 +183,8 @@ class ChunkTrainer:
         losses = {"spatial": self._spatial(step.output)}
         if self.state.registered.usable:
             losses["registered"] = self.config.loss.registered * self._registered_distance(step)
+        if self.avatar.prior is not None:
+            losses["residual"] = self.config.loss.registered * self._residual(step)
         return losses | self._temporal(step) if streams else losses
 
     def _spatial(self, output: NetworkOutput) -> Tensor:
@@ -194,6 +196,14 @@ class ChunkTrainer:
         offsets = self.avatar.gather_control_points(step.unmirrored_output.offset)
         maps, has_map = self.state.registered.targets(step.cursors)
         return (registered_loss(offsets, maps) * has_map).mean()
+
+    def _residual(self, step: _Step) -> Tensor:
+        """Return what it costs to move the garments away from the motion prior."""
+        if self.avatar.prior is None:
+            return torch.zeros(())
+        residual = self.avatar.gather_control_points(step.output.offset - step.driving.base)
+        garment = residual[:, self.avatar.garment_control_points()] * CENTIMETRES
+        return self.config.loss.residual * garment.square().sum(-1).mean()
 
     def _compare_gradients(self, losses: Mapping[str, Tensor]) -> dict[str, float] | None:
         weight, norms = self.avatar.network.encoder.pyramid.first.weight, {}

@@ -22,7 +22,8 @@ from dsar.training.budget import check_budget
 from dsar.training.checkpoint import Run, check_files, load_checkpoint, read_config, read_progress
 from dsar.training.chunk import ChunkTrainer
 from dsar.training.kept_views import KeptViews, kept_bytes
-from dsar.training.optimizers import set_rates
+from dsar.training.layers import Layers
+from dsar.training.optimizers import keep_still, set_rates
 from dsar.training.pace import Clock, leave, stop_signals
 from dsar.training.prior_fitting import fit_prior
 from dsar.training.registration import Registration
@@ -98,6 +99,12 @@ def _train(
     views = KeptViews(capture)
     trainer = ChunkTrainer(config, views, state, signals, lpips)
     registration = Registration(config, views, avatar, state.rest, state.registered, signals)
+    layers = Layers(views, avatar, state.registered, signals, clips)
+
+    def settle_layers() -> None:
+        layers.settle()
+        keep_still(state.optimizers, avatar)
+
     gradients = workers.Gradients([*avatar.parameters(), *state.rest.parameters()])
     if resume:
         read_checkpoint(run, state)
@@ -116,7 +123,11 @@ def _train(
                 show = partial(monitor.show, state.step, state.progress, "registration")
                 stop = _register(registration, gradients, received, clock, limit, state.progress, show)
                 state.seconds = limit.seconds
+                if state.registered.complete:
+                    settle_layers()
                 continue
+            if schedule_state.stage != "template" and avatar.texel_hidden.any():
+                settle_layers()
             if schedule_state.stage != "template" and avatar.prior is not None and not avatar.prior.placed:
                 fit_prior(avatar, state.registered, signals, still, config.seed)
                 signals = {name: avatar.with_cloth(signal) for name, signal in signals.items()}

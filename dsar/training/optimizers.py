@@ -56,3 +56,11 @@ def set_rates(optimizers: Mapping[str, torch.optim.Optimizer], schedule_state: S
     if "muon" in optimizers:
         for group in optimizers["muon"].param_groups:
             group["lr"] = schedule_state.muon_rate
+
+
+def keep_still(optimizers: Mapping[str, torch.optim.Optimizer], avatar: Avatar) -> None:
+    """Forget the momentum of fixed Gaussians: they get no gradient any more, but would drift on by it."""
+    slots = optimizers["adam"].state
+    for parameter in avatar.template.parameters():
+        if parameter in slots:
+            slots[parameter]["exp_avg"][avatar.texel_beneath] = 0.0

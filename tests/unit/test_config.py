@@ -10,7 +10,7 @@ import pytest
 from dsar.cli import parse
 from dsar.cli.train import Train
 from dsar.config import PRESETS, TrainConfig, config_from_json, config_to_json
-from dsar.config.migrations import RENAMED, rename_settings
+from dsar.config.migrations import ADDED, RENAMED, rename_settings
 from dsar.errors import ConfigError
 
 OLD = Path(__file__).parents[1] / "data" / "config-format-3.json"
@@ -51,6 +51,10 @@ def test_a_config_of_the_old_names_is_read_to_the_settings_that_it_meant():
         assert section == same
         assert read[section][new] == old[section].pop(name), now
         assert read[section].pop(new) != dataclasses.asdict(PRESETS["small"])[section][new], now
+    # Those that came later are as if they were not there.
+    for name, value in ADDED.items():
+        section, setting = name.split(".")
+        assert read[section].pop(setting) == value
     # All others have the name that they had.
     assert read == old
 
@@ -92,7 +96,8 @@ def flags_of(settings: dict) -> list[str]:
 def test_old_flags_go_on_working_and_say_the_new_names(caplog):
     old = json.loads(OLD.read_text())
     with caplog.at_level(logging.WARNING):
-        command = parse(["train", "--preset", "small", "--seed", "7", *flags_of(old)])
+        later = ["--model.prior", "none"]
+        command = parse(["train", "--preset", "small", "--seed", "7", *flags_of(old), *later])
     assert isinstance(command, Train)
     assert command.config() == config_from_json(OLD)
     lines = [record.getMessage() for record in caplog.records]

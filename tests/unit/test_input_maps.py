@@ -53,9 +53,8 @@ def stiff_motion(fps: float, seconds_per_second: float = 1.0) -> Motion:
 
 
 def make(grid: ControlGrid, motion: Motion, axes: str = "body", **changes: object) -> InputMaps:
-    model = ModelConfig(
-        **{"axes": axes, "upsample": 4, "mean_time_constants": TIME_CONSTANTS, **changes}  # pyright: ignore
-    )
+    usual = {"axes": axes, "upsample": 4, "mean_time_constants": TIME_CONSTANTS, "prior": "none"}
+    model = ModelConfig(**{**usual, **changes})  # pyright: ignore
     signal = DrivingSignal.of_motion(BODY, motion, model.mean_time_constants)
     return make_input_maps(grid, signal.windows, BODY.joints[0], motion.fps, model)
 
@@ -189,3 +188,22 @@ def test_cells_without_a_control_point_are_zero():
     inputs = make(grid, stiff_motion(30.0))
     assert not inputs.maps[:, :, ~grid.occupied].any()
     assert not inputs.magnitude[:, :, ~grid.occupied].any()
+
+
+def test_the_motion_prior_comes_last_at_the_last_control_points_and_nowhere_else():
+    grid, motion = grid_of("body"), stiff_motion(30.0)
+    model = ModelConfig(axes="body", upsample=4, mean_time_constants=TIME_CONSTANTS)
+    signal = DrivingSignal.of_motion(BODY, motion, model.mean_time_constants)
+    cloth = torch.rand(FRAMES, 5, 6, generator=torch.Generator().manual_seed(0)) + 0.1
+    maps = make_input_maps(grid, signal.windows, BODY.joints[0], 30.0, model, cloth).maps
+    assert maps.shape[1] == model.map_channels
+    assert torch.equal(maps[:, :-6], make(grid, motion).maps)
+    prior = grid.gather(maps[:, -6:])
+    assert torch.equal(prior[:, -5:], cloth)
+    assert not prior[:, :-5].any()
+    assert not maps[:, -6:, ~grid.occupied].any()
+
+
+def test_a_model_with_a_motion_prior_takes_no_frames_without_it():
+    with pytest.raises(ValueError, match="prior"):
+        make(grid_of("body"), stiff_motion(30.0), prior="cloth")

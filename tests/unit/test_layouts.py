@@ -15,6 +15,7 @@ from dsar.data.captures.formats import open_capture
 from dsar.data.captures.scans import _load
 from dsar.errors import BodyError, CaptureError, DsarError, MotionError
 from dsar.geometry.cameras import project
+from dsar.raster.mesh import rasterize_mesh
 
 SEQUENCE = "turn"
 RANGES = {"train_frames": "0-7", "test_frames": "9-13"}
@@ -136,6 +137,49 @@ def test_virtual_cameras_stand_between_the_released_ones(written):
     azimuths = torch.atan2(centers[:, 0], centers[:, 2])
     apart = (azimuths[4:, None] - azimuths[None, :4] + np.pi).remainder(2 * np.pi) - np.pi
     assert float(apart.abs().min()) > 0.4
+
+
+def test_labels_of_the_scans_say_where_the_garment_is(written, original):
+    capture = open_written(written, "dress")
+    height, joints = capture.body.vertices[:, 1], capture.body.joints[:, 1]
+    lower = (height > joints[4]) & (height < joints[0])
+    for index in (1, 6):
+        image, mask = capture.image("Take1", 5, index), capture.garment_mask("Take1", 5, index)
+        assert mask.shape == image.shape[:2]
+        assert not mask[image[..., 3] == 0].any()
+        vertices = pose_vertices(capture.body, capture.motions["Take1"][5])
+        view = rasterize_mesh(vertices, capture.body.faces, capture.cameras[index])
+        seen = capture.body.faces[view.faces.clamp_min(0)]
+        expected = (view.faces >= 0) & lower[seen].all(-1)
+        border = (view.faces >= 0) & lower[seen].any(-1)
+        assert mask[expected.numpy()].all()
+        assert not mask[~border.numpy()].any()
+    assert original.garment_mask("turn", 0, 0) is None
+
+
+def test_an_outer_garment_is_the_garment_of_a_frame_that_has_one(folder, written):
+    root = folder("dress")
+    path = root / "Take1/Semantic/labels/label-f00016.pkl"
+    labels = pickle.loads(path.read_bytes())["scan_labels"]
+    heights = open_capture(root, body=written / "body.npz").body.vertices[:, 1].numpy()
+    path.write_bytes(pickle.dumps({"scan_labels": np.where(heights > heights.mean(), 5, labels)}))
+    capture = open_capture(root, body=written / "body.npz")
+    before, after = (capture.garment_mask("Take1", frame, 0) for frame in (4, 5))
+    assert np.flatnonzero(after.any(1)).max() < np.flatnonzero(before.any(1)).max()
+    path.unlink()
+    assert open_capture(root, body=written / "body.npz").garment_mask("Take1", 5, 0) is None
+
+
+@pytest.mark.parametrize(
+    "content", [{}, {"scan_labels": np.zeros(7)}, {"scan_labels": "skin"}, [1], {"scan_labels": None}]
+)
+def test_broken_labels_are_named_when_they_are_asked_for(folder, written, content):
+    root = folder("dress")
+    path = root / "Take1/Semantic/labels/label-f00013.pkl"
+    path.write_bytes(pickle.dumps(content))
+    capture = open_capture(root, body=written / "body.npz")
+    with pytest.raises(CaptureError, match=r"labels .*label-f00013\.pkl: expected"):
+        capture.garment_mask("Take1", 2, 0)
 
 
 @pytest.mark.parametrize("name", [*WRITERS, "dress"])

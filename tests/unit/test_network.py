@@ -112,6 +112,7 @@ ABLATIONS = {
     "without velocity": ({"velocity": False}, {"encoder.pyramid.first.weight"}),
     "without acceleration": ({"acceleration": False}, {"encoder.pyramid.first.weight"}),
     "without running means": ({"mean_time_constants": ()}, {"encoder.pyramid.first.weight"}),
+    "without motion prior": ({"prior": "none"}, {"encoder.pyramid.first.weight"}),
     "without motion embedding": ({"motion_embedding": False}, {"motion_embedding."}),
     "mean of rows": ({"readout": "mean"}, set()),
     "bidirectional": ({"readout": "mean", "causal": False}, set()),
@@ -128,13 +129,13 @@ FIRST = "encoder.pyramid.first.weight"
 
 def kept_maps(config):
     """Return which channels of SMALL's maps another configuration has: position, then what it switches."""
-    switched = {
-        "velocity": config.velocity,
-        "acceleration": config.acceleration,
-        "mean_time_constants": bool(config.mean_time_constants),
-    }
-    groups = {"velocity": range(3, 6), "acceleration": range(6, 9), "mean_time_constants": range(9, 18)}
-    return [0, 1, 2, *(channel for name, group in groups.items() if switched[name] for channel in group)]
+    groups = (
+        (config.velocity, range(3, 6)),
+        (config.acceleration, range(6, 9)),
+        (bool(config.mean_time_constants), range(9, 18)),
+        (config.prior == "cloth", range(18, 24)),
+    )
+    return [0, 1, 2, *(channel for present, group in groups if present for channel in group)]
 
 
 @pytest.mark.parametrize("name", ABLATIONS)

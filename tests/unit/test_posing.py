@@ -89,13 +89,14 @@ def test_fused_posing_equals_sampling_activation_and_posing_in_turn(degree):
     turns = matrix_from_axis_angle(random(2, n, 3))
     blended = torch.cat([turns * 1.1, random(2, n, 3, 1)], -1)
     offset, appearance = (random(2, c, 6, 4).mul(0.2).requires_grad_() for c in (3, channels))
-    leaves = [offset, appearance, *template.parameters()]
+    leaves, fixed = [offset, appearance, *template.parameters()], torch.arange(n) % 3 == 0
 
     offsets = (axes * sample_bilinear(offset, sampling)[..., None, :]).sum(-1)
-    expected = pose_gaussians(template.activate(offsets, sample_bilinear(appearance, sampling)), blended)
-    fused = pose_fused(
-        template, offset, appearance, sampling, axes, blended, nearest_quaternions(blended[..., :3])
+    expected = pose_gaussians(
+        template.activate(offsets, sample_bilinear(appearance, sampling), fixed), blended
     )
+    rotations = nearest_quaternions(blended[..., :3])
+    fused = pose_fused(template, offset, appearance, sampling, axes, blended, rotations, fixed)
     fields = [[value for g in both for value in vars(g).values()] for both in (expected, fused)]
     for slow, fast in zip(*fields, strict=True):
         assert torch.allclose(slow, fast, atol=1e-6)

@@ -110,8 +110,8 @@ def test_twins_meet_where_the_state_is_forgotten_and_only_there(avatar, motion):
     class Elephant(Avatar):
         """Never forgets: adds its previous offset to the next."""
 
-        def forward_frame(self, motion_window, state, **streams):
-            output, after, maps = super().forward_frame(motion_window, state, **streams)
+        def forward_frame(self, motion_window, state, cloth=None, **streams):
+            output, after, maps = super().forward_frame(motion_window, state, cloth, **streams)
             offset = output.offset + state.offsets[:, -1]
             after = dataclasses.replace(after, offsets=torch.cat([after.offsets[:, 1:], offset[:, None]], 1))
             return dataclasses.replace(output, offset=offset), after, maps

@@ -6,6 +6,7 @@ SUBJECT/OUTFIT/TakeN/
   Capture/cameras.pkl                 intrinsics 3x3 and extrinsics 3x4 (OpenCV, world to camera) by camera
   Capture/CAMERA/images/capture-fFRAME.png, masks/mask-fFRAME.png
   Meshes_pkl/mesh-fFRAME.pkl, atlas-fFRAME.pkl
+  Semantic/labels/label-fFRAME.pkl    scan_labels: 0 to 5 for each vertex of the mesh (optional)
 
 Its pickles are read without running them.
 """
@@ -87,7 +88,10 @@ def open_4d_dress(root: Path, options: OpenOptions) -> MultiViewCapture:
             "stay at rest. Give --body or $DSAR_BODY",
             root,
         )
-    scans = [Scans(folder / "Meshes_pkl", frames) for folder, (frames, _) in zip(folders, info, strict=True)]
+    scans = [
+        Scans(folder / "Meshes_pkl", frames, folder / "Semantic" / "labels")
+        for folder, (frames, _) in zip(folders, info, strict=True)
+    ]
     fits = [_read_fits(folder, scan.frames, hands) for folder, scan in zip(folders, scans, strict=True)]
     virtual = []
     if all(scan.complete for scan in scans):
@@ -106,7 +110,7 @@ def open_4d_dress(root: Path, options: OpenOptions) -> MultiViewCapture:
             folders=names,
             conversions=conversions,
         )
-        views = PhotosAndScans(photos, scan, {camera.name: camera for camera in virtual})
+        views = PhotosAndScans(photos, scan, *({c.name: c for c in group} for group in (virtual, released)))
         takes.append(Take(motion, views))
     return make_capture(
         root,

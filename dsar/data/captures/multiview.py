@@ -9,7 +9,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from dsar.data.images.decoding import CACHE_BYTES
@@ -38,6 +38,19 @@ class Views(Protocol):
 
         Raises:
             CaptureError: It is not there, cannot be decoded or has the wrong size.
+        """
+        ...
+
+
+@runtime_checkable
+class LabelledViews(Views, Protocol):
+    """Images with labels."""
+
+    def garment_mask(self, camera: Camera, frame: int) -> Bool[np.ndarray, "h w"] | None:
+        """Return where an image shows loose garments; None where there are no labels of it.
+
+        Raises:
+            CaptureError: They cannot be read.
         """
         ...
 
@@ -186,6 +199,17 @@ class MultiViewCapture:
         if sequence not in self.views:
             raise CaptureError(f"capture {self.name}, {sequence}: an unseen motion has no images")
         return self.views[sequence].read(view, frame + self.starts.get(sequence, 0))
+
+    def garment_mask(self, sequence: str, frame: int, camera: int) -> Bool[np.ndarray, "h w"] | None:
+        """Return where an image shows loose garments, by the capture's own labels; None without any.
+
+        Raises:
+            CaptureError: The labels cannot be read.
+        """
+        views = self.views.get(sequence)
+        if not isinstance(views, LabelledViews):
+            return None
+        return views.garment_mask(self.cameras[camera], frame + self.starts.get(sequence, 0))
 
     def garment(self, sequence: str, run: int = 0) -> Float[np.ndarray, "f v 3"]:
         """Return the simulated garment's true vertices, world metres.

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from dsar.data.images.decoding import CACHE
@@ -28,6 +28,9 @@ from dsar.types import Camera
 VIRTUAL_CAMERAS = 4
 """Cameras that are added to the released ones."""
 _SAMPLES = 2
+_UPPER, _LOWER, _OUTER = 3, 4, 5
+_LABELS = range(6)
+"""4D-DRESS's labels of a scan's vertices: skin, hair, shoe, upper, lower, outer."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,8 @@ class Scans:
     """Their folder."""
     frames: Sequence[str]
     """The frames' names."""
+    labels: Path | None = None
+    """Folder of the labels of the meshes' vertices, a pickle by frame."""
 
     def paths(self, frame: int) -> tuple[Path, Path]:
         """Return where a frame's mesh and texture are."""
@@ -78,6 +83,31 @@ class Scans:
         alpha = blocks[..., 3:]
         straight = torch.cat([blocks[..., :3] / alpha.clamp_min(1e-6), alpha], -1)
         return (straight * 255).round().byte().numpy()
+
+    def label_path(self, frame: int) -> Path | None:
+        """Return where the labels of a frame's mesh are; None where it has none."""
+        path = self.labels and self.labels / f"label-f{self.frames[frame]}.pkl"
+        return path if path and path.is_file() and self.paths(frame)[0].is_file() else None
+
+    def garment_mask(self, camera: Camera, frame: int) -> Bool[np.ndarray, "h w"] | None:
+        """Return where a camera sees the outer garment, without one upper or lower; None without labels.
+
+        Raises:
+            CaptureError: mesh or labels are damaged, or not what they should be.
+        """
+        path = self.label_path(frame)
+        if path is None:
+            return None
+        mesh = self._read(self.paths(frame)[0])
+        labels = _read_labels(path, len(mesh["vertices"]))
+        garment = labels == _OUTER
+        if not garment.any():
+            garment = (labels == _UPPER) | (labels == _LOWER)
+        vertices, faces = torch.from_numpy(mesh["vertices"]), torch.from_numpy(mesh["faces"])
+        view = rasterize_mesh(vertices, faces, camera)
+        corners = torch.from_numpy(garment)[faces[view.faces.clamp_min(0)]]
+        share = (view.weights * corners).sum(-1)
+        return ((view.faces >= 0) & (share >= 0.5)).numpy()
 
     def _read(self, path: Path) -> Mapping[str, np.ndarray]:
         content = _load(path)
@@ -128,6 +158,21 @@ def _load_once(path: Path, _time: int, _size: int) -> Any:
         raise CaptureError(f"{path}: cannot be read as data ({error}); download it again") from error
 
 
+def _read_labels(path: Path, vertices: int) -> Int[np.ndarray, " v"]:
+    """Return a label of 4D-DRESS for each vertex of a mesh."""
+    content = _load(path)
+    try:
+        labels = np.asarray(content["scan_labels"], np.int64)
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise CaptureError(f"labels {path}: expected scan_labels ({error!r}); download it again") from error
+    if labels.shape != (vertices,) or not np.isin(labels, _LABELS).all():
+        raise CaptureError(
+            f"labels {path}: expected {vertices} labels of 0 to 5, one a vertex of the scan, found "
+            f"shape {labels.shape} of {labels.min(initial=0)} to {labels.max(initial=0)}"
+        )
+    return labels
+
+
 def sample_texture(texture: Float[Tensor, "h w 3"], uv: Float[Tensor, "n 2"]) -> Float[Tensor, "n 4"]:
     """Return bilinear colours at texture coordinates, and ones. Row 0 of the data set's textures is v = 0."""
     grid = (2 * uv - 1)[None, None]
@@ -146,6 +191,8 @@ class PhotosAndScans:
     """What the others see."""
     cameras: Mapping[str, Camera] = field(default_factory=dict)
     """The others, by name, in the scans' world."""
+    released: Mapping[str, Camera] = field(default_factory=dict)
+    """The released ones, by name, in the scans' world."""
 
     def has(self, camera: Camera, frame: int) -> bool:
         """Return whether there is a photograph with its mask, or a textured scan."""
@@ -158,6 +205,14 @@ class PhotosAndScans:
         own = self.cameras[camera.name]
         key = (self.scans.paths(frame)[0], camera.name)
         return CACHE.get(key, lambda: self.scans.render(own, frame))
+
+    def garment_mask(self, camera: Camera, frame: int) -> Bool[np.ndarray, "h w"] | None:
+        """Return where a camera sees a garment by the scans' labels; None without, or raise CaptureError."""
+        own = {**self.released, **self.cameras}.get(camera.name)
+        path = self.scans.label_path(frame)
+        if own is None or path is None:
+            return None
+        return CACHE.get((path, camera.name), lambda: self.scans.garment_mask(own, frame))
 
     def check_samples(self, cameras: Sequence[Camera]) -> None:
         """Look at some photographs of each released camera, log what is converted, or raise CaptureError."""

@@ -46,7 +46,9 @@ _NO_VELOCITY: _Settings = {
     "model.acceleration": False,
     "model.mean_time_constants": (),
 }
-_WINDOW_ONLY: _Settings = {**_NO_FEEDBACK, **_NO_BANK}
+_NO_PRIOR: _Settings = {"model.prior": "none"}
+_NO_LAGS: _Settings = {"model.mean_time_constants": ()}
+_WINDOW_ONLY: _Settings = {**_NO_FEEDBACK, **_NO_BANK, **_NO_PRIOR}
 _POSE_ONLY: _Settings = {
     **_WINDOW_ONLY,
     **_NO_VELOCITY,
@@ -154,13 +156,26 @@ ABLATIONS: dict[str, Table] = {
             Row("all of it", seeds=3),
             Row("the paper's wiring", {"model.wiring": "shared"}),
             Row("late wiring", {"model.wiring": "late"}),
-            Row("without lags", {"model.mean_time_constants": ()}),
+            Row("without lags", _NO_LAGS),
             Row("without acceleration", {"model.acceleration": False}),
             Row("without the map of identities", {"model.uv_feature_channels": 0}),
             Row("without registration", {"schedule.pretraining_fraction": 0.0, "loss.registered": 0.0}),
             Row("without a smooth template", {"loss.shape": 0.0}),
             Row("without mirrored rollouts", {"schedule.mirrored_fraction": 0.0}),
             Row("Adam alone", {"schedule.muon_rate": 0.0}, seeds=3),
+        ),
+    ),
+    "memories": Table(
+        "What remembers: the motion prior, running means (lags), the bank, the previous offset",
+        (
+            Row("all four", seeds=3),
+            Row("without the prior", _NO_PRIOR, seeds=3),
+            Row("without lags", _NO_LAGS),
+            Row("without the bank", _NO_BANK),
+            Row("without feedback", _NO_FEEDBACK),
+            Row("the prior alone", {**_NO_FEEDBACK, **_NO_BANK, **_NO_LAGS, "model.window": 1}),
+            Row("lags alone", {**_NO_FEEDBACK, **_NO_BANK, **_NO_PRIOR, "model.window": 1}),
+            Row("bank and feedback alone (the paper's two streams)", {**_NO_PRIOR, **_NO_LAGS}),
         ),
     ),
     "sizes": Table(

@@ -4,7 +4,11 @@ import dataclasses
 
 import torch
 
+from dsar.avatar.avatar import Avatar
+from dsar.avatar.rollout import roll_out
 from dsar.body.model import JOINT_NAMES
+from dsar.config import TrainConfig
+from dsar.data.captures.formats import open_capture
 from dsar_render.labels import GARMENT, label_parts
 
 
@@ -75,3 +79,17 @@ def test_left_and_right_hands_are_where_they_are(figure, labels):
     assert middle["left_hand"][0] > middle["left_arm"][0] > middle["torso"][0] > middle["right_arm"][0]
     assert middle["right_arm"][0] > middle["right_hand"][0]
     assert middle["head"][1] > middle["torso"][1] > middle["left_leg"][1] > middle["left_foot"][1]
+
+
+def test_mattes_and_layers_agree_on_what_is_garment_and_what_is_beneath():
+    torch.manual_seed(0)
+    capture, config = open_capture("embedded"), TrainConfig()
+    avatar = Avatar.from_capture(capture, capture.body, config.atlas, config.model)
+    motion = capture.motions["sway"].slice(0, 1)
+    names, indices = label_parts(roll_out(avatar, motion).binding)
+    garment = torch.zeros(avatar.num_gaussians, dtype=torch.bool)
+    garment[avatar.garment_texels()] = True
+    assert torch.equal(indices == names.index(GARMENT), garment)
+    assert not garment[avatar.texel_beneath].any()
+    beneath = {names[index] for index in indices[avatar.texel_beneath].unique().tolist()}
+    assert {"left_leg", "right_leg"} <= beneath <= {"left_leg", "right_leg", "torso"}
