@@ -7,13 +7,15 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
+from matplotlib.ticker import FuncFormatter
 
-KINDS = {"regression": ("C0", "o"), "simulation": ("C1", "s"), "variant": ("C3", "X")}
+KINDS = {"regression": ("C0", "o"), "simulation": ("C1", "s")}
+_PLAIN = FuncFormatter(lambda value, _: f"{value:g}")
 
 
 def draw_chart(results: list[dict], path: Path) -> None:
     """Draw a panel for each subject: milliseconds a frame and the error over the template's."""
-    layout = {"figsize": (8 * len(results), 6), "sharey": True, "squeeze": False, "layout": "constrained"}
+    layout = {"figsize": (8 * len(results), 8), "sharey": True, "squeeze": False, "layout": "constrained"}
     figure, panels = plt.subplots(1, len(results), **layout)
     for axes, found in zip(panels[0], results, strict=True):
         _draw(axes, found)
@@ -35,10 +37,9 @@ def _draw(axes: Axes, found: dict) -> None:
             place = (row["ms"], row["ratio"])
             axes.annotate(name, place, (5, 3), textcoords="offset points", fontsize=7)
     axes.axhline(1, color="grey", linestyle="--", linewidth=1, label="template")
-    second = next((row["ratio"] for row in found["rows"] if row["name"] == "a second true run"), None)
-    if second:
-        axes.axhline(second, color="green", linestyle=":", linewidth=1, label="a second true run")
     axes.set_xscale("log")
+    axes.set_xlim(0.03, 2)
+    axes.xaxis.set_major_formatter(_PLAIN)
     axes.set_xlabel("processor time a frame [ms]; regressions in plain NumPy")
     axes.set_title(found["subject"])
     axes.grid(alpha=0.3)
