@@ -149,7 +149,7 @@ class _Fit:
         ], hanging
 
     def _trust(self, offsets: Sequence[Float[Tensor, "f g 3"]]) -> Float[Tensor, " r"]:
-        """Return by row the share of the simulated offsets that explains the maps best; 1 without maps."""
+        """Return by row the share of the simulated offsets that explains the maps best; 1 where none tell."""
         rows, columns = self.garment.rest.shape[:2]
         if not self.clips:
             return torch.ones(rows)
@@ -158,7 +158,8 @@ class _Fit:
         simulated, target = torch.cat(list(offsets)), torch.cat([clip.target for clip in self.clips])
         explained = (simulated * target).sum((0, 2)) @ of_row
         size = simulated.square().sum((0, 2)) @ of_row
-        return (explained / size.clamp_min(1e-9) / SHRUNK).clamp(0, 1)
+        share = (explained / size.clamp_min(1e-9) / SHRUNK).clamp(0, 1)
+        return torch.where(size > 0, share, torch.ones(rows))
 
 
 def constants_at(logarithms: Float[np.ndarray, " k"]) -> ClothConstants:

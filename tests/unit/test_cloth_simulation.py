@@ -252,7 +252,7 @@ def test_the_walk_finds_the_nearest_body_point_nearly_always(skirt):
         close = distances.min(1) < 0.12
         found.append((own < distances.min(1) + 5e-3)[close])
     assert len(np.concatenate(found)) > 1000
-    assert np.concatenate(found).mean() > 0.95
+    assert np.concatenate(found).mean() > 0.93
 
 
 def test_no_point_outside_one_leg_takes_the_other_leg_s_inside_for_nearest(skirt):

@@ -89,15 +89,12 @@ class Scans:
         path = self.labels and self.labels / f"label-f{self.frames[frame]}.pkl"
         return path if path and path.is_file() and self.paths(frame)[0].is_file() else None
 
-    def garment_mask(self, camera: Camera, frame: int) -> Bool[np.ndarray, "h w"] | None:
-        """Return where a camera sees the outer garment, without one upper or lower; None without labels.
+    def garment_mask(self, camera: Camera, frame: int, path: Path) -> Bool[np.ndarray, "h w"]:
+        """Return where a camera sees the outer garment, without one upper or lower, by the labels in a file.
 
         Raises:
             CaptureError: mesh or labels are damaged, or not what they should be.
         """
-        path = self.label_path(frame)
-        if path is None:
-            return None
         mesh = self._read(self.paths(frame)[0])
         labels = _read_labels(path, len(mesh["vertices"]))
         garment = labels == _OUTER
@@ -212,7 +209,7 @@ class PhotosAndScans:
         path = self.scans.label_path(frame)
         if own is None or path is None:
             return None
-        return CACHE.get((path, camera.name), lambda: self.scans.garment_mask(own, frame))
+        return CACHE.get((path, camera.name), lambda: self.scans.garment_mask(own, frame, path))
 
     def check_samples(self, cameras: Sequence[Camera]) -> None:
         """Look at some photographs of each released camera, log what is converted, or raise CaptureError."""
