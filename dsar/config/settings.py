@@ -125,7 +125,7 @@ class LossConfig:
     """The same of the template's own shape: how far neighbouring texels part from the garment's chart."""
     registered: float = 0.04
     """Distance in cm to the registered maps while images are compared (extension)."""
-    residual: float = 0.06
+    residual: float = 0.03
     """Squared way, in cm, of the garments from their motion prior, beside each cm from the registered maps
     (extension): what a few training motions would have the network add fits no others."""
     feature: float = 0.01

@@ -12,31 +12,31 @@ from numpy import ndarray
 class ClothConstants:
     """What kind of cloth it is; compliances are of unit mass (Macklin et al. 2019)."""
 
-    drag: float = 0.8
+    drag: float = 1.3
     """Quadratic air drag along the normal, 1/m."""
-    damping: float = 0.8
+    damping: float = 0.4
     """Linear damping of the velocity, 1/s."""
-    viscosity: float = 24.0
+    viscosity: float = 15.0
     """Rate at which a point takes its neighbours' mean velocity, 1/s."""
-    friction: float = 0.54
+    friction: float = 0.7
     """Coulomb coefficient against the body."""
     thickness: float = 0.006
     """Distance kept from the body, metres."""
-    pull: float = 2.1
+    pull: float = 5.5
     """Stiffness of the way home, 1/s²."""
-    homing: float = 0.4
+    homing: float = 0.3
     """Damping of the velocity relative to home, 1/s."""
-    core: float = 0.5
+    core: float = 0.65
     """Share of its home's distance from the middle of its row within which no point comes."""
-    slack: float = 1.03
+    slack: float = 1.04
     """How much wider than at rest the hem is once its folds are stretched out."""
-    give: float = 1.01
+    give: float = 1.025
     """The same for the diagonals, which carry the waist's turning to the hem."""
-    shear: float = 3.3e-6
+    shear: float = 6e-6
     """Compliance of the grid's diagonals."""
-    bend: float = 2.7e-3
+    bend: float = 7e-4
     """Compliance of the two-apart struts that resist bending."""
-    fold: float = 2.3e-2
+    fold: float = 8.5e-3
     """Compliance of the struts a sixth of the way around that keep folds few and large."""
 
     @classmethod

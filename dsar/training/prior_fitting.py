@@ -29,7 +29,7 @@ GENERATIONS, POPULATION = 10, 12
 """Of the search (CMA-ES, Hansen 2016)."""
 SPREAD = 0.5
 """First standard deviation of the constants' logarithms."""
-USUAL = 0.01
+USUAL = 0.004
 """Weight of the squared distance of the logarithms from the usual constants."""
 FARTHEST = 0.3
 """Metres of error above which a map counts as lost rather than as wrong."""
