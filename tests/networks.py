@@ -5,7 +5,14 @@ import torch
 from dsar.config import ModelConfig
 from dsar.network import DualStreamNetwork, NetworkState, build_network
 
-SMALL = ModelConfig(window=4, memory=3, channels=(4, 8), heads=2, uv_feature_channels=2)
+SMALL = ModelConfig(
+    window=4,
+    memory=3,
+    mean_time_constants=(0.1, 0.2, 0.4),
+    channels=(4, 8),
+    heads=2,
+    uv_feature_channels=2,
+)
 SIZE = (8, 12)
 WIRINGS = ("perframe", "late", "shared")
 VARIANTS = {

@@ -56,9 +56,10 @@ class ModelConfig:
     """Feed velocity maps."""
     acceleration: bool = True
     """Feed acceleration maps (extension; it nearly halves the error of driven cloth)."""
-    mean_time_constants: tuple[float, ...] = (0.1, 0.2, 0.4)
-    """Time constants, seconds, of running means of the motion; for each, the displacement from the newest
-    position to the mean is an input map (extension): a memory that nothing has to learn."""
+    mean_time_constants: tuple[float, ...] = ()
+    """Time constants, seconds, of running means of the motion (such as 0.1 0.2 0.4); for each, the
+    displacement from the newest position to the mean is an input map (extension): a memory that nothing has
+    to learn. Beside a motion prior it only teaches a few motions by heart."""
     prior: Literal["cloth", "none"] = "cloth"
     """`cloth`: a coarse simulation of each loose garment, driven by the same motion, is an input map and the
     base of the offset (extension); `none`: the paper's. Without a loose garment there is none."""

@@ -96,7 +96,7 @@ def flags_of(settings: dict) -> list[str]:
 def test_old_flags_go_on_working_and_say_the_new_names(caplog):
     old = json.loads(OLD.read_text())
     with caplog.at_level(logging.WARNING):
-        later = ["--model.prior", "none"]
+        later = [part for name, value in ADDED.items() for part in (f"--{name}", str(value))]
         command = parse(["train", "--preset", "small", "--seed", "7", *flags_of(old), *later])
     assert isinstance(command, Train)
     assert command.config() == config_from_json(OLD)

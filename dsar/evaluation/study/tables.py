@@ -47,7 +47,7 @@ _NO_VELOCITY: _Settings = {
     "model.mean_time_constants": (),
 }
 _NO_PRIOR: _Settings = {"model.prior": "none"}
-_NO_LAGS: _Settings = {"model.mean_time_constants": ()}
+_LAGS: _Settings = {"model.mean_time_constants": (0.1, 0.2, 0.4)}
 _WINDOW_ONLY: _Settings = {**_NO_FEEDBACK, **_NO_BANK, **_NO_PRIOR}
 _POSE_ONLY: _Settings = {
     **_WINDOW_ONLY,
@@ -156,7 +156,7 @@ ABLATIONS: dict[str, Table] = {
             Row("all of it", seeds=3),
             Row("the paper's wiring", {"model.wiring": "shared"}),
             Row("late wiring", {"model.wiring": "late"}),
-            Row("without lags", _NO_LAGS),
+            Row("without the motion prior", _NO_PRIOR, seeds=3),
             Row("without acceleration", {"model.acceleration": False}),
             Row("without the map of identities", {"model.uv_feature_channels": 0}),
             Row("without registration", {"schedule.pretraining_fraction": 0.0, "loss.registered": 0.0}),
@@ -166,16 +166,15 @@ ABLATIONS: dict[str, Table] = {
         ),
     ),
     "memories": Table(
-        "What remembers: the motion prior, running means (lags), the bank, the previous offset",
+        "What remembers: the motion prior, the bank, the previous offset, running means (lags)",
         (
-            Row("all four", seeds=3),
-            Row("without the prior", _NO_PRIOR, seeds=3),
-            Row("without lags", _NO_LAGS),
+            Row("prior, bank and feedback", seeds=3),
+            Row("bank and feedback alone (the paper's two streams)", _NO_PRIOR, seeds=3),
             Row("without the bank", _NO_BANK),
             Row("without feedback", _NO_FEEDBACK),
-            Row("the prior alone", {**_NO_FEEDBACK, **_NO_BANK, **_NO_LAGS, "model.window": 1}),
-            Row("lags alone", {**_NO_FEEDBACK, **_NO_BANK, **_NO_PRIOR, "model.window": 1}),
-            Row("bank and feedback alone (the paper's two streams)", {**_NO_PRIOR, **_NO_LAGS}),
+            Row("the prior alone", {**_NO_FEEDBACK, **_NO_BANK, "model.window": 1}),
+            Row("lags beside the prior", _LAGS),
+            Row("lags in its place", {**_NO_PRIOR, **_LAGS}, seeds=3),
         ),
     ),
     "sizes": Table(
