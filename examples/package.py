@@ -11,6 +11,7 @@ requires = [
     "numpy-1.26+<3",
     "torch-2.8+",
     "numba",
+    "cma",
     "jaxtyping",
     "jinja2",
     "plotly",

@@ -40,7 +40,16 @@ def skirt_avatar(axes: str = "surface", prior: str = "none") -> Avatar:
         tangents=tube_tangents(positions.unflatten(0, (ROWS, COLUMNS))),
     )
     torch.manual_seed(0)
-    model = ModelConfig(channels=(4, 8), heads=2, window=3, memory=2, upsample=4, axes=axes, prior=prior)
+    model = ModelConfig(
+        channels=(4, 8),
+        heads=2,
+        window=3,
+        memory=2,
+        upsample=4,
+        axes=axes,
+        mean_time_constants=(0.1, 0.2, 0.4),
+        prior=prior,
+    )
     avatar = Avatar(body, Atlas.stack([body_chart(body, COLUMNS), skirt]), model, FPS).eval()
     with torch.no_grad():
         avatar.template.means += 0.004 * torch.randn(avatar.template.means.shape)

@@ -27,6 +27,8 @@ RENAMED = {
 """Old and new name of each setting, with its section."""
 ADDED = {"model.prior": "none", "loss.residual": 0.0}
 """Settings that came later, and the value by which runs from before go on as they were."""
+FORMER_DEFAULTS = ADDED | {"model.mean_time_constants": (0.1, 0.2, 0.4)}
+"""What settings were when nobody gave them: a run from then goes on by the command that began it."""
 RENAMED_STAGES = {"imitation": "pretraining"}
 """Old and new name of each stage of training, as metrics.jsonl says it."""
 

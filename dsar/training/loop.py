@@ -28,7 +28,7 @@ from dsar.training.pace import Clock, leave, stop_signals
 from dsar.training.prior_fitting import fit_prior
 from dsar.training.registration import Registration
 from dsar.training.report import REPORT_EVERY, Monitor, Reporter, UpdateMetrics, warn_if_cut_short
-from dsar.training.resuming import check_same_settings, resumed_settings, with_body
+from dsar.training.resuming import check_same_settings, resumed_settings, with_body, with_former_defaults
 from dsar.training.scene import scene_of_capture, write_scene
 from dsar.training.schedule import ScheduleState, schedule_at, without_pretraining
 from dsar.training.state import TrainingState
@@ -71,7 +71,9 @@ def train(config: TrainConfig, run: Run, *, resume: bool = False, report: Report
     config = with_body(config, capture)
     if resume:
         check_files(run)
-        check_same_settings(config, resumed_settings(run, config, whole), run)
+        saved = resumed_settings(run, config, whole)
+        config = with_former_defaults(config, saved)
+        check_same_settings(config, saved, run)
     done = read_progress(run).progress if resume else 0.0
     images = capture.kept_bytes + kept_bytes(capture)
     budget = check_budget(config, workers.local_count(config.workers), done, images)

@@ -3,7 +3,8 @@
 import dataclasses
 import logging
 
-from dsar.config import TrainConfig
+from dsar.config import PRESETS, TrainConfig
+from dsar.config.migrations import FORMER_DEFAULTS
 from dsar.data.captures.multiview import MultiViewCapture
 from dsar.errors import ConfigError
 from dsar.training.checkpoint import Run, read_config
@@ -29,6 +30,18 @@ def resumed_settings(run: Run, config: TrainConfig, capture: MultiViewCapture) -
         _log.info("Run %s: its capture was %s and is %s now", run.folder, saved.capture, config.capture)
         return dataclasses.replace(saved, capture=config.capture)
     return saved
+
+
+def with_former_defaults(config: TrainConfig, saved: TrainConfig) -> TrainConfig:
+    """Return settings with the defaults of a run's day, where it has them and nothing else was asked."""
+    usual = PRESETS[config.preset]
+    for setting, former in FORMER_DEFAULTS.items():
+        section, name = setting.split(".")
+        given, default, kept = (getattr(getattr(c, section), name) for c in (config, usual, saved))
+        if given == default and kept == former:
+            changed = dataclasses.replace(getattr(config, section), **{name: former})
+            config = dataclasses.replace(config, **{section: changed})
+    return config
 
 
 def check_same_settings(config: TrainConfig, saved: TrainConfig, run: Run) -> None:

@@ -178,7 +178,7 @@ def test_residuals_move_fixed_texels_and_do_not_change_their_looks(capture, avat
 
 def test_images_never_reach_fixed_texels_and_momentum_does_not_move_them(capture, avatar, signals):
     state = TrainingState.begin(TrainConfig(), capture, avatar, {"sway": range(9)}, [("sway", 0)])
-    trainer = ChunkTrainer(TrainConfig(), capture, state, signals, None)
+    trainer = ChunkTrainer(TrainConfig(), KeptViews(capture), state, signals, None)
     gradients = Gradients([*avatar.parameters(), *state.rest.parameters()])
     adam = state.optimizers["adam"]
     for seed in range(2):

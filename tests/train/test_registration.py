@@ -166,7 +166,9 @@ def test_the_network_learns_to_follow_maps_that_lag_behind_the_motion(registered
     capture, _, registration, _ = registered
     torch.manual_seed(0)
     config = TrainConfig()
-    model = ModelConfig(channels=(8, 16, 16), window=3, memory=2, heads=2)
+    model = ModelConfig(
+        channels=(8, 16, 16), window=3, memory=2, heads=2, mean_time_constants=(0.1, 0.2, 0.4), prior="none"
+    )
     config = dataclasses.replace(config, model=model)
     small = Avatar.from_capture(capture, capture.body, config.atlas, model)
     state = TrainingState.begin(config, capture, small, {SEQUENCE: range(4, LAST + 1)}, [])

@@ -155,7 +155,7 @@ def test_a_teleport_takes_the_clothes_along_and_they_go_on_as_they_would_have(av
 )
 def test_maps_that_are_switched_off_leave_the_others_and_the_speed_as_they_are(setting, off, gone):
     body, atlas = load_body(), Atlas.stack([body_chart(load_body(), 16)])
-    config = ModelConfig(channels=(4, 8), heads=2, mean_time_constants=(0.1, 0.2, 0.4))
+    config = ModelConfig(channels=(4, 8), heads=2, mean_time_constants=(0.1, 0.2, 0.4), prior="none")
     seen = []
     for model in (config, dataclasses.replace(config, **{setting: off})):
         avatar = Avatar(body, atlas, model, 30.0)
