@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from dsar.avatar.charts import Chart
 from dsar.avatar.control_grid import ControlGrid
+from dsar.avatar.input_maps import REFERENCE_FPS
 from dsar.dynamics.cloth import ClothConstants
 from dsar.dynamics.collider import BodyCollider
 from dsar.dynamics.simulation import ClothSimulation, Fabric, Stage
@@ -25,8 +26,6 @@ GRID = (9, 24)
 """Points of a simulated garment, down and around."""
 CHANNELS = 6
 """Of a frame at each control point: offset, and its change since the frame before."""
-REFERENCE_FPS = 30.0
-"""Changes are metres per 1/30 s whatever the motion's own rate."""
 HANGING_SECONDS = 3.0
 """Time at rest after which simulated cloth is taken to hang still."""
 

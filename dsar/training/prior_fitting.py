@@ -98,9 +98,10 @@ class _Fit:
             self.simulation.stage(signals[name].steady[[frame]]) for name, frame in list(still.items())[:4]
         ]
         self.clips = [
-            _Clip(self.simulation.stage(signals[name].steady[:count]), maps.offsets[name][:count][:, points])
-            for name in sorted(maps.clips)
+            _Clip(self.simulation.stage(signals[name].steady[fitted]), maps.offsets[name][fitted][:, points])
+            for name, clip in sorted(maps.clips.items())
             if (count := int(maps.fitted[name])) > 1
+            for fitted in (slice(clip.start, clip.start + count),)
         ]
 
     def run(self, seed: int) -> None:
