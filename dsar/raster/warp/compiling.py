@@ -1,0 +1,110 @@
+"""How Warp compiles the kernels, and starts one where torch's tensors are."""
+
+import inspect
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+
+
+def func(function: Callable[..., Any]) -> Any:
+    """Compile a part of a kernel."""
+    # Unwrapped, like kernels: checks that an import hook put around it are not for the compiler.
+    return wp.func(inspect.unwrap(function))
+
+
+def kernel(function: Callable[..., Any]) -> Any:
+    """Compile a function that `launch` starts."""
+    return wp.kernel(inspect.unwrap(function), enable_backward=False)
+
+
+def differentiable_kernel(function: Callable[..., Any]) -> Any:
+    """Compile a function that `launch` starts, and its derivative, which `launch_adjoint` starts."""
+    return wp.kernel(inspect.unwrap(function), enable_backward=True)
+
+
+@cache
+def start_warp() -> None:
+    """Start Warp without its greeting, and have it run blocks of threads on the CPU as on a GPU.
+
+    Without the latter a block on the CPU is one thread, and what threads do together would remain untried.
+    """
+    wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
+    wp.config.enable_cpu_blocks = True
+    wp.init()
+
+
+def launch(
+    kernel: Any,
+    dim: int,
+    inputs: Sequence[Any],
+    *,
+    device: torch.device,
+    block: int | None = None,
+) -> None:
+    """Start a kernel on the stream that torch uses now.
+
+    Args:
+        kernel: What to start.
+        dim: Number of threads, or, with `block`, of blocks.
+        inputs: Its arguments: tensors become arrays of the type that the kernel names.
+        device: Of the tensors.
+        block: Threads in a block, for kernels whose threads work together.
+    """
+    wanted = [argument.type for argument in kernel.adj.args]
+    arguments = [_as_argument(value, kind) for value, kind in zip(inputs, wanted, strict=True)]
+    where = {"device": wp.device_from_torch(device), "stream": _stream(device)}
+    if block is None:
+        wp.launch(kernel, dim, arguments, **where, record_tape=False)
+    else:
+        wp.launch_tiled(kernel, dim=[dim], inputs=arguments, block_dim=block, **where, record_tape=False)
+
+
+def launch_adjoint(
+    kernel: Any, dim: int, inputs: Sequence[Any], gradients: Sequence[Tensor | None], device: torch.device
+) -> None:
+    """Start the derivative of a kernel.
+
+    Args:
+        kernel: What was started.
+        dim: Number of its threads.
+        inputs: Its arguments, outputs included.
+        gradients: By argument: where to add the gradient, or, for an output, the gradient that arrives; None
+            for what has none.
+        device: Of the tensors.
+    """
+    wanted = [argument.type for argument in kernel.adj.args]
+    arguments = [_as_argument(value, kind) for value, kind in zip(inputs, wanted, strict=True)]
+    adjoints = [_as_argument(value, kind) for value, kind in zip(gradients, wanted, strict=True)]
+    # A number has no array for its gradient: it passes as itself.
+    adjoints = [
+        argument if adjoint is None and not isinstance(value, Tensor) else adjoint
+        for value, argument, adjoint in zip(inputs, arguments, adjoints, strict=True)
+    ]
+    wp.launch(
+        kernel,
+        dim,
+        arguments,
+        [],
+        adj_inputs=adjoints,
+        adj_outputs=[],
+        adjoint=True,
+        record_tape=False,
+        device=wp.device_from_torch(device),
+        stream=_stream(device),
+    )
+
+
+def _as_argument(value: Any, kind: Any) -> Any:
+    """Return a tensor's memory as an array of a kernel's argument; anything else as it is."""
+    if not isinstance(value, Tensor):
+        return value
+    return wp.from_torch(value.detach(), dtype=kind.dtype, requires_grad=False, return_ctype=True)
+
+
+def _stream(device: torch.device) -> Any:
+    """Return torch's current stream, None on the CPU."""
+    return wp.stream_from_torch(device) if device.type == "cuda" else None
