@@ -3,9 +3,11 @@
 import dataclasses
 import math
 
+import pytest
 import torch
 from hypothesis import event, given, settings
 from hypothesis import strategies as st
+from raster_scenes import WARP
 
 from dsar.raster import rasterize
 from dsar.types import Camera, Gaussians
@@ -59,9 +61,9 @@ def scenes(draw):
     return gaussians
 
 
-def draw_and_differentiate(gaussians, camera, backend, dtype, antialiased):
-    leaves = gaussians.map(lambda values: values.to(dtype).requires_grad_())
-    output = rasterize(leaves, camera, backend=backend, antialiased=antialiased, outputs=EXTRAS)
+def draw_and_differentiate(gaussians, camera, backend, dtype, **options):
+    leaves = gaussians.map(lambda values: values.to(dtype, copy=True).requires_grad_())
+    output = rasterize(leaves, camera, backend=backend, outputs=EXTRAS, **options)
     # Depth is a quotient by alpha: its gradient is as inexact as a faint pixel's alpha, one minus nearly one.
     images = (output.color, output.alpha, output.depth * output.alpha.detach())
     generator = torch.Generator().manual_seed(1)
@@ -71,11 +73,18 @@ def draw_and_differentiate(gaussians, camera, backend, dtype, antialiased):
     return output, torch.autograd.grad(loss, fields, materialize_grads=True)
 
 
+@pytest.mark.parametrize("backend", ["cpu", WARP])
 @settings(max_examples=60, deadline=None)
-@given(gaussians=scenes(), camera=cameras(), antialiased=st.booleans())
-def test_fast_equals_slow_on_any_scene(gaussians, camera, antialiased):
-    slow, slow_gradients = draw_and_differentiate(gaussians, camera, "reference", torch.float64, antialiased)
-    fast, fast_gradients = draw_and_differentiate(gaussians, camera, "cpu", torch.float32, antialiased)
+@given(
+    gaussians=scenes(),
+    camera=cameras(),
+    antialiased=st.booleans(),
+    dilation=st.sampled_from([0.1375, 0.3, 2.0]),
+)
+def test_fast_equals_slow_on_any_scene(backend, gaussians, camera, antialiased, dilation):
+    options = {"antialiased": antialiased, "dilation": dilation}
+    slow, slow_gradients = draw_and_differentiate(gaussians, camera, "reference", torch.float64, **options)
+    fast, fast_gradients = draw_and_differentiate(gaussians, camera, backend, torch.float32, **options)
     # A fragment right at a cut-off (alpha of 1/255, transmittance of 1e-4) may fall on either side of it.
     same = slow.contributors.counts == fast.contributors.counts
     assert (~same).sum() <= 1 + 0.002 * same.numel()

@@ -1,6 +1,5 @@
 """How Warp compiles the kernels, and starts one where torch's tensors are."""
 
-import inspect
 from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any
@@ -9,26 +8,51 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from dsar.errors import ConfigError
+
 
 def func(function: Callable[..., Any]) -> Any:
     """Compile a part of a kernel."""
-    # Unwrapped, like kernels: checks that an import hook put around it are not for the compiler.
-    return wp.func(inspect.unwrap(function))
+    return wp.func(_with_types(function))
 
 
 def kernel(function: Callable[..., Any]) -> Any:
     """Compile a function that `launch` starts."""
-    return wp.kernel(inspect.unwrap(function), enable_backward=False)
+    return wp.kernel(_with_types(function), enable_backward=False)
 
 
 def differentiable_kernel(function: Callable[..., Any]) -> Any:
     """Compile a function that `launch` starts, and its derivative, which `launch_adjoint` starts."""
-    return wp.kernel(inspect.unwrap(function), enable_backward=True)
+    return wp.kernel(_with_types(function), enable_backward=True)
+
+
+def _with_types(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Let Warp read the types of a function that is marked, for all others, as not to be checked.
+
+    Checkers of Python's types know neither Warp's arrays nor that numbers there have a size.
+    """
+    function.__dict__.pop("__no_type_check__", None)
+    return function
+
+
+def start_warp(device: torch.device) -> None:
+    """Make Warp ready for a device.
+
+    Raises:
+        ConfigError: It cannot use the GPU.
+    """
+    _start_warp()
+    if device.type == "cuda" and not wp.is_cuda_available():
+        driver = ".".join(map(str, wp.get_cuda_driver_version() or ("none",)))
+        raise ConfigError(
+            f"rasterize: Warp {wp.config.version} does not find a CUDA driver that it can use (version found: "
+            f"{driver}); update NVIDIA's driver, or install gsplat and take backend='gsplat'"
+        )
 
 
 @cache
-def start_warp() -> None:
-    """Start Warp without its greeting, and have it run blocks of threads on the CPU as on a GPU.
+def _start_warp() -> None:
+    """Start Warp without its greeting, and let blocks on the CPU have as many threads as on a GPU.
 
     Without the latter a block on the CPU is one thread, and what threads do together would remain untried.
     """
@@ -107,4 +131,12 @@ def _as_argument(value: Any, kind: Any) -> Any:
 
 def _stream(device: torch.device) -> Any:
     """Return torch's current stream, None on the CPU."""
-    return wp.stream_from_torch(device) if device.type == "cuda" else None
+    if device.type == "cpu":
+        return None
+    return _as_warp_stream(torch.cuda.current_stream(device))
+
+
+@cache
+def _as_warp_stream(stream: torch.cuda.Stream) -> Any:
+    """Return a stream of torch as one of Warp; torch keeps few, and never gives them up."""
+    return wp.stream_from_torch(stream)

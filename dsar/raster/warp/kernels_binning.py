@@ -1,7 +1,7 @@
-# pyright: reportInvalidTypeForm=false
 """Warp kernels: the list of pairs of a tile and a splat that touches it, and the sums over a splat's pairs."""
 
 import math
+from typing import no_type_check
 
 import warp as wp
 
@@ -18,18 +18,21 @@ _MARGIN = wp.constant(1e-4)
 
 
 @func
+@no_type_check
 def pixel_index(coordinate: float, size: int):
     """Return the first pixel whose centre is at or beyond a coordinate, held to 0..size."""
     return int(wp.clamp(wp.ceil(coordinate - 0.5), 0.0, float(size)))
 
 
 @func
+@no_type_check
 def pixel_end(coordinate: float, size: int):
     """Return the end of the pixels whose centres are at or before a coordinate, held to 0..size."""
     return int(wp.clamp(wp.floor(coordinate + 0.5), 0.0, float(size)))
 
 
 @func
+@no_type_check
 def half_chord(dy: float, reach: float, stretch: float, height: float):
     """Return half the length of the outline's chord at a height above the mean, pixels."""
     rest = wp.max(reach - height * height * dy * dy, 0.0)
@@ -37,8 +40,9 @@ def half_chord(dy: float, reach: float, stretch: float, height: float):
 
 
 @kernel
+@no_type_check
 def list_pairs(
-    drawable: wp.array[int], records: wp.array[Record], instance_ends: wp.array[int],
+    drawable: wp.array[int], records: wp.array[Record], instance_bounds: wp.array[int],
     views: wp.array2d[int], pair_ends: wp.array[wp.int64], counts: wp.array[int],
     keys: wp.array[wp.int64], owners: wp.array[int],
 ):  # fmt: skip
@@ -53,7 +57,7 @@ def list_pairs(
     i = wp.tid()
     count = int(0)
     if drawable[i] != 0:
-        view = wp.lower_bound(instance_ends, i + 1)
+        view = wp.lower_bound(instance_bounds, i + 1) - 1
         r = records[i]
         x, y, stretch, shear, height = r[0], r[1], r[2], r[3], r[4]
         reach = r[5] - _LOG_ALPHA_MIN + _SLACK
@@ -65,13 +69,14 @@ def list_pairs(
         half_width, lift = wp.sqrt(reach) * spread / stretch, half_height * slope / spread
         y0, y1 = pixel_index(y - half_height, views[view, HEIGHT]), pixel_end(y + half_height, views[view, HEIGHT])
         x0, x1 = pixel_index(x - half_width, views[view, WIDTH]), pixel_end(x + half_width, views[view, WIDTH])
+        end = (y1 + TILE - 1) // TILE
         if x0 >= x1 or y0 >= y1:
             drawable[i] = 0
-            y1 = y0
+            end = y0 // TILE
         place = int(0)
         if keys.shape[0] > 0 and i > 0:
             place = int(pair_ends[i - 1])
-        for tile_y in range(y0 // TILE, (y1 + TILE - 1) // TILE):
+        for tile_y in range(y0 // TILE, end):
             # The rows of the tile that the splat reaches, as dy.
             high = y - (float(wp.max(y0, tile_y * TILE)) + 0.5)
             low = y - (float(wp.min(y1, tile_y * TILE + TILE)) - 0.5)
@@ -95,6 +100,7 @@ def list_pairs(
 
 
 @kernel
+@no_type_check
 def sum_pairs(
     pair_ends: wp.array[wp.int64], pair_sums: wp.array[Record], sums: wp.array[Record]
 ):

@@ -1,4 +1,3 @@
-# pyright: reportInvalidTypeForm=false
 """Warp kernels: splats blended front to back into the pixels of a tile, and the way back.
 
 A block of THREADS threads takes a tile, each thread PIXELS of its pixels. Splats come into the block's shared
@@ -8,6 +7,7 @@ so gradients are the same to the bit in every run.
 """
 
 import math
+from typing import no_type_check
 
 import warp as wp
 
@@ -29,6 +29,7 @@ _LOG_ALPHA_MAX = wp.constant(math.log(ALPHA_MAX))
 
 
 @func
+@no_type_check
 def tile_corner(tile: int, view: int, views: wp.array2d[int]):
     """Return the left and top pixel of a tile."""
     local = tile - views[view, FIRST_TILE]
@@ -37,6 +38,7 @@ def tile_corner(tile: int, view: int, views: wp.array2d[int]):
 
 
 @func
+@no_type_check
 def pixel_of(corner: wp.vec2i, thread: int, p: int):
     """Return the p-th pixel of a thread: neighbours belong to neighbouring threads."""
     q = thread + p * THREADS
@@ -44,6 +46,7 @@ def pixel_of(corner: wp.vec2i, thread: int, p: int):
 
 
 @func
+@no_type_check
 def pixel_place(pixel: wp.vec2i, view: int, views: wp.array2d[int]):
     """Return where a pixel lies in flat images, -1 outside its view."""
     if pixel[0] >= views[view, WIDTH] or pixel[1] >= views[view, HEIGHT]:
@@ -52,6 +55,7 @@ def pixel_place(pixel: wp.vec2i, view: int, views: wp.array2d[int]):
 
 
 @func
+@no_type_check
 def log_alpha_at(r: Record, x: float, y: float):
     """Return e1, e2 and the logarithm of a splat's alpha (not yet limited) at a point of the image."""
     dx, dy = r[0] - x, r[1] - y
@@ -61,6 +65,7 @@ def log_alpha_at(r: Record, x: float, y: float):
 
 
 @kernel
+@no_type_check
 def composite(
     tile_ends: wp.array[int], views: wp.array2d[int], starts: wp.array[int], pairs: wp.array[int],
     records: wp.array[Record], backgrounds: wp.array[wp.vec3],
@@ -118,6 +123,7 @@ def composite(
 
 
 @kernel
+@no_type_check
 def composite_backward(
     tile_ends: wp.array[int], views: wp.array2d[int], starts: wp.array[int], pairs: wp.array[int],
     records: wp.array[Record], backgrounds: wp.array[wp.vec3], depth: wp.array[float],

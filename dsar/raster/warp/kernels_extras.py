@@ -1,5 +1,6 @@
-# pyright: reportInvalidTypeForm=false
 """Warp kernel: what is known of a pixel besides its colour, alpha and expected depth."""
+
+from typing import no_type_check
 
 import warp as wp
 
@@ -22,6 +23,7 @@ from dsar.raster.warp.tables import FIRST_INSTANCE
 
 
 @kernel
+@no_type_check
 def composite_extras(
     tile_ends: wp.array[int], views: wp.array2d[int], starts: wp.array[int], pairs: wp.array[int],
     records: wp.array[Record], medians: wp.array[float], first_hits: wp.array[float],

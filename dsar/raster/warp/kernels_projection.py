@@ -1,4 +1,3 @@
-# pyright: reportInvalidTypeForm=false
 """Warp kernels: Gaussians in the world to splats on the images. Warp derives the way back.
 
 A splat's record is mean x, mean y, stretch, shear, height, log opacity, red, green, blue and z. Its fall-off is
@@ -10,6 +9,8 @@ Unlike the conic (a, b, c) this cannot turn negative by rounding, however thin t
 
 A thread takes one Gaussian through all views of its set, so that no two threads add to the same gradient.
 """
+
+from typing import no_type_check
 
 import warp as wp
 
@@ -27,7 +28,9 @@ from dsar.raster.warp.tables import (
     WIDTH,
 )
 
-Record = wp.types.vector(length=10, dtype=wp.float32)
+RECORD_SIZE = 10
+"""Numbers in a splat's record."""
+Record = wp.types.vector(length=RECORD_SIZE, dtype=wp.float32)
 Shape = wp.types.vector(length=6, dtype=wp.float32)
 
 _NEAR = wp.constant(NEAR)
@@ -41,12 +44,14 @@ _C3D, _C3E = map(wp.constant, (0.3731763325901154, 1.445305721320277))
 
 
 @func
+@no_type_check
 def row(table: wp.array2d[float], view: int, start: int):
     """Return three consecutive numbers of a view's row."""
     return wp.vec3(table[view, start], table[view, start + 1], table[view, start + 2])
 
 
 @func
+@no_type_check
 def camera_point(mean: wp.vec3, cameras: wp.array2d[float], view: int):
     """Return a point in camera coordinates, metres."""
     rotated = wp.vec3(
@@ -58,6 +63,7 @@ def camera_point(mean: wp.vec3, cameras: wp.array2d[float], view: int):
 
 
 @func
+@no_type_check
 def image_axis(
     point: wp.vec3, size: int, axis: int, cameras: wp.array2d[float], view: int
 ):
@@ -71,6 +77,7 @@ def image_axis(
 
 
 @func
+@no_type_check
 def rotation_matrix(q: wp.vec4):
     """Return the matrix of a quaternion wxyz, which need not be normalised."""
     u = q / wp.sqrt(wp.dot(q, q))
@@ -83,6 +90,7 @@ def rotation_matrix(q: wp.vec4):
 
 
 @func
+@no_type_check
 def project(
     mean: wp.vec3, rotation: wp.vec4, scales: wp.vec3, opacity: float,
     views: wp.array2d[int], cameras: wp.array2d[float], view: int, dilation: float, antialiased: int,
@@ -113,6 +121,7 @@ def project(
 
 
 @func
+@no_type_check
 def shade(
     mean: wp.vec3, harmonics: wp.array2d[wp.vec3], g: int, cameras: wp.array2d[float], view: int
 ):
@@ -140,6 +149,7 @@ def shade(
 
 
 @kernel
+@no_type_check
 def find_drawable(
     means: wp.array[wp.vec3], rotations: wp.array[wp.vec4], scales: wp.array[wp.vec3],
     opacities: wp.array[float], harmonics: wp.array2d[wp.vec3], set_ends: wp.array[int],
@@ -168,6 +178,7 @@ def find_drawable(
 
 
 @differentiable_kernel
+@no_type_check
 def make_records(
     means: wp.array[wp.vec3], rotations: wp.array[wp.vec4], scales: wp.array[wp.vec3],
     opacities: wp.array[float], harmonics: wp.array2d[wp.vec3], set_ends: wp.array[int],

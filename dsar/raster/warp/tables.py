@@ -1,4 +1,3 @@
-# pyright: reportInvalidTypeForm=false
 """What the kernels know of a batch: whose Gaussians each view shows, and where its part of every array lies.
 
 The images of all views lie one after another in flat arrays, row by row, and so do their tiles, tile row by
@@ -32,27 +31,25 @@ class Tables:
 
     sizes: tuple[tuple[int, int], ...]
     """Height and width of each view, pixels."""
-    counts: tuple[int, ...]
-    """Gaussians of each view."""
     gaussians: int
     """Of all sets."""
+    instances: int
+    """Of all views, likewise tiles."""
     tiles: int
-    """Of all views."""
     views: Int32[Tensor, "v 7"]
     """See the columns above."""
     tile_ends: Int32[Tensor, " v"]
     """End of each view's tiles."""
+    pixel_bounds: Int32[Tensor, " v1"]
+    """Where each view's pixels start, and the number of all."""
+    instance_bounds: Int32[Tensor, " v1"]
+    """Where each view's instances start, and the number of all."""
     set_ends: Int32[Tensor, " s"]
     """End of each set's Gaussians."""
     first_views: Int32[Tensor, " s1"]
     """First view of each set, and the number of views."""
     cameras: Float[Tensor, "v 19"]
     """See the columns above."""
-
-    @property
-    def instances(self) -> int:
-        """The number of Gaussians in all views."""
-        return sum(self.counts)
 
     @cached_property
     def pixels(self) -> list[int]:
@@ -66,34 +63,40 @@ def make_tables(
     """Lay out a batch: sets of so many Gaussians, each seen by its cameras."""
     flat = [camera for group in cameras for camera in group]
     owners = [index for index, group in enumerate(cameras) for _ in group]
-    starts = [0, *accumulate(counts)]
-    view_counts = [counts[owner] for owner in owners]
     grids = [(-(-camera.width // TILE), -(-camera.height // TILE)) for camera in flat]
-    rows = zip(
+    sets = _bounds(counts)
+    instances = _bounds([counts[owner] for owner in owners])
+    pixels = _bounds([camera.width * camera.height for camera in flat])
+    tiles = _bounds([across * down for across, down in grids])
+    # One column each, in the order of the constants above.
+    columns = (
         [camera.width for camera in flat],
         [camera.height for camera in flat],
         [across for across, _ in grids],
-        accumulate((across * down for across, down in grids), initial=0),
-        accumulate((camera.width * camera.height for camera in flat), initial=0),
-        accumulate(view_counts, initial=0),
-        [starts[owner] for owner in owners],
+        tiles[:-1],
+        pixels[:-1],
+        instances[:-1],
+        [sets[owner] for owner in owners],
     )
-    views = [value for row in rows for value in row]
-    tile_ends = list(accumulate(across * down for across, down in grids))
-    first_views = list(accumulate((len(group) for group in cameras), initial=0))
+    views = [value for row in zip(*columns, strict=True) for value in row]
+    parts = [views, tiles[1:], pixels, instances, sets[1:], _bounds([len(group) for group in cameras])]
     # In one piece, so that one copy brings all to the device.
-    parts = [views, tile_ends, starts[1:], first_views]
     packed = torch.tensor([value for part in parts for value in part], dtype=torch.int32).to(device)
-    split = packed.split([len(part) for part in parts])
+    table, *rest = packed.split([len(part) for part in parts])
     return Tables(
         tuple((camera.height, camera.width) for camera in flat),
-        tuple(view_counts),
-        starts[-1],
-        tile_ends[-1],
-        split[0].view(len(flat), 7),
-        *split[1:],
+        sets[-1],
+        instances[-1],
+        tiles[-1],
+        table.view(len(flat), len(columns)),
+        *rest,
         torch.stack([_pack_camera(camera) for camera in flat]).to(device),
     )
+
+
+def _bounds(counts: Sequence[int]) -> list[int]:
+    """Return where each of consecutive parts starts, and where the last one ends."""
+    return list(accumulate(counts, initial=0))
 
 
 def _pack_camera(camera: Camera) -> Float[Tensor, "19"]:

@@ -78,4 +78,4 @@ def test_inputs_that_do_not_fit_are_refused():
     ):
         check_outputs(["normals"])
     with pytest.raises(ConfigError, match="float32 tensors on a GPU, not"):
-        rasterize(gaussians, camera, backend="cuda")
+        rasterize(gaussians, camera, backend="gsplat")
