@@ -5,7 +5,7 @@ from functools import cache
 from typing import Any
 
 import torch
-import warp as wp
+import warp as wp  # pyright: ignore[reportMissingImports]  # optional
 from torch import Tensor
 
 from dsar.errors import ConfigError

@@ -3,7 +3,7 @@
 import math
 from typing import no_type_check
 
-import warp as wp
+import warp as wp  # pyright: ignore[reportMissingImports]  # optional
 
 from dsar.raster.conventions import ALPHA_MIN
 from dsar.raster.warp.compiling import func, kernel
@@ -67,8 +67,14 @@ def list_pairs(
         half_height = wp.sqrt(reach) / height
         spread = wp.sqrt(1.0 + slope * slope)
         half_width, lift = wp.sqrt(reach) * spread / stretch, half_height * slope / spread
-        y0, y1 = pixel_index(y - half_height, views[view, HEIGHT]), pixel_end(y + half_height, views[view, HEIGHT])
-        x0, x1 = pixel_index(x - half_width, views[view, WIDTH]), pixel_end(x + half_width, views[view, WIDTH])
+        y0, y1 = (
+            pixel_index(y - half_height, views[view, HEIGHT]),
+            pixel_end(y + half_height, views[view, HEIGHT]),
+        )
+        x0, x1 = (
+            pixel_index(x - half_width, views[view, WIDTH]),
+            pixel_end(x + half_width, views[view, WIDTH]),
+        )
         end = (y1 + TILE - 1) // TILE
         if x0 >= x1 or y0 >= y1:
             drawable[i] = 0
@@ -101,9 +107,7 @@ def list_pairs(
 
 @kernel
 @no_type_check
-def sum_pairs(
-    pair_ends: wp.array[wp.int64], pair_sums: wp.array[Record], sums: wp.array[Record]
-):
+def sum_pairs(pair_ends: wp.array[wp.int64], pair_sums: wp.array[Record], sums: wp.array[Record]):
     """Add up what the pairs of each instance hold, always in the same order."""
     i = wp.tid()
     first = int(0)

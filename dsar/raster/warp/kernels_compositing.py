@@ -9,7 +9,7 @@ so gradients are the same to the bit in every run.
 import math
 from typing import no_type_check
 
-import warp as wp
+import warp as wp  # pyright: ignore[reportMissingImports]  # optional
 
 from dsar.raster.conventions import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
 from dsar.raster.warp.compiling import func, kernel
@@ -19,6 +19,8 @@ from dsar.raster.warp.tables import FIRST_PIXEL, FIRST_TILE, HEIGHT, TILE, TILES
 THREADS = wp.constant(64)
 PIXELS = wp.constant(TILE * TILE // THREADS)
 BATCH = wp.constant(64)
+# For kernels that are compiled ahead of time; a launch says it itself.
+wp.set_module_options({"block_dim": THREADS})
 
 Floats = wp.types.vector(length=PIXELS, dtype=wp.float32)
 Ints = wp.types.vector(length=PIXELS, dtype=wp.int32)
@@ -173,7 +175,13 @@ def composite_backward(
                         a = wp.min(wp.exp(e[2]), ALPHA_MAX_F)
                         before = light[p] / (1.0 - a)
                         weight = a * before
-                        q = v_red[p] * r[6] + v_green[p] * r[7] + v_blue[p] * r[8] + v_far[p] * r[9] + level[p]
+                        q = (
+                            v_red[p] * r[6]
+                            + v_green[p] * r[7]
+                            + v_blue[p] * r[8]
+                            + v_far[p] * r[9]
+                            + level[p]
+                        )
                         v_log = float(0.0)
                         if e[2] < _LOG_ALPHA_MAX:
                             v_log = a * (q * before - behind[p] / (1.0 - a))

@@ -2,7 +2,7 @@
 
 from typing import no_type_check
 
-import warp as wp
+import warp as wp  # pyright: ignore[reportMissingImports]  # optional
 
 from dsar.raster.warp.compiling import kernel
 from dsar.raster.warp.kernels_compositing import (
@@ -11,6 +11,7 @@ from dsar.raster.warp.kernels_compositing import (
     LOG_ALPHA_MIN,
     PIXELS,
     T_MIN,
+    THREADS,
     Floats,
     Ints,
     log_alpha_at,
@@ -20,6 +21,9 @@ from dsar.raster.warp.kernels_compositing import (
 )
 from dsar.raster.warp.kernels_projection import Record
 from dsar.raster.warp.tables import FIRST_INSTANCE
+
+# For kernels that are compiled ahead of time; a launch says it itself.
+wp.set_module_options({"block_dim": THREADS})
 
 
 @kernel

@@ -12,7 +12,7 @@ A thread takes one Gaussian through all views of its set, so that no two threads
 
 from typing import no_type_check
 
-import warp as wp
+import warp as wp  # pyright: ignore[reportMissingImports]  # optional
 
 from dsar.raster.conventions import ALPHA_MIN, FRUSTUM_MARGIN, NEAR
 from dsar.raster.warp.compiling import differentiable_kernel, func, kernel
@@ -64,9 +64,7 @@ def camera_point(mean: wp.vec3, cameras: wp.array2d[float], view: int):
 
 @func
 @no_type_check
-def image_axis(
-    point: wp.vec3, size: int, axis: int, cameras: wp.array2d[float], view: int
-):
+def image_axis(point: wp.vec3, size: int, axis: int, cameras: wp.array2d[float], view: int):
     """Return d(pixel x or y)/d(world), linearised at the point, held inside the widened image."""
     focal, center = cameras[view, FOCAL + axis], cameras[view, PRINCIPAL + axis]
     margin = _MARGIN * float(size) / focal
@@ -122,16 +120,16 @@ def project(
 
 @func
 @no_type_check
-def shade(
-    mean: wp.vec3, harmonics: wp.array2d[wp.vec3], g: int, cameras: wp.array2d[float], view: int
-):
+def shade(mean: wp.vec3, harmonics: wp.array2d[wp.vec3], g: int, cameras: wp.array2d[float], view: int):
     """Return the colour of a Gaussian: basis, order and signs are dsar.geometry.harmonics'."""
     color = harmonics[g, 0] * _C0
     count = harmonics.shape[1]
     if count > 1:
         d = wp.normalize(mean - row(cameras, view, CENTER))
         x, y, z = d[0], d[1], d[2]
-        color = color + harmonics[g, 2] * (_C1 * z) - harmonics[g, 1] * (_C1 * y) - harmonics[g, 3] * (_C1 * x)
+        color = (
+            color + harmonics[g, 2] * (_C1 * z) - harmonics[g, 1] * (_C1 * y) - harmonics[g, 3] * (_C1 * x)
+        )
         if count > 4:
             color = color + harmonics[g, 4] * (_C2A * x * y) - harmonics[g, 5] * (_C2A * y * z)
             color = color + harmonics[g, 6] * (_C2B * (3.0 * z * z - 1.0)) - harmonics[g, 7] * (_C2A * x * z)

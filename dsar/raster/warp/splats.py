@@ -49,9 +49,7 @@ class Splats:
         return bounds.diff() - drawn[bounds].diff()
 
 
-def make_splats(
-    fields: Sequence[Tensor], tables: Tables, dilation: float, antialiased: bool
-) -> Splats:
+def make_splats(fields: Sequence[Tensor], tables: Tables, dilation: float, antialiased: bool) -> Splats:
     """Project Gaussians, given by the fields of all sets, and list the splats of every tile.
 
     Raises:
@@ -82,9 +80,7 @@ def make_splats(
     keys, places = keys.sort(stable=True)
     tiles = torch.arange(tables.tiles + 1, device=device) << 32
     starts = torch.searchsorted(keys, tiles, out_int32=True)
-    return Splats(
-        tables, dilation, antialiased, drawable, records, pair_ends, places, owners[places], starts
-    )
+    return Splats(tables, dilation, antialiased, drawable, records, pair_ends, places, owners[places], starts)
 
 
 def differentiate_splats(
@@ -94,9 +90,7 @@ def differentiate_splats(
     tables, device = splats.tables, pair_sums.device
     sums = torch.empty_like(splats.records)
     launch(sum_pairs, tables.instances, [splats.pair_ends, pair_sums, sums], device=device)
-    arguments = _projection_arguments(
-        fields, tables, splats.dilation, splats.antialiased, splats.drawable
-    )
+    arguments = _projection_arguments(fields, tables, splats.dilation, splats.antialiased, splats.drawable)
     gradients = [torch.zeros_like(field) for field in fields]
     between = [None] * (len(arguments) - len(fields))
     launch_adjoint(
@@ -107,7 +101,7 @@ def differentiate_splats(
 
 def _projection_arguments(
     fields: Sequence[Tensor], tables: Tables, dilation: float, antialiased: bool, drawable: Tensor
-) -> list[Tensor | float]:
+) -> list[Tensor | float | int]:
     """Return what both kernels of the projection take."""
     layout = [tables.set_ends, tables.first_views, tables.views, tables.cameras]
     return [*fields, *layout, dilation, int(antialiased), drawable]

@@ -10,7 +10,7 @@ from functools import cached_property
 from itertools import accumulate
 
 import torch
-import warp as wp
+import warp as wp  # pyright: ignore[reportMissingImports]  # optional
 from jaxtyping import Float, Int32
 from torch import Tensor
 
@@ -57,9 +57,7 @@ class Tables:
         return [height * width for height, width in self.sizes]
 
 
-def make_tables(
-    counts: Sequence[int], cameras: Sequence[Sequence[Camera]], device: torch.device
-) -> Tables:
+def make_tables(counts: Sequence[int], cameras: Sequence[Sequence[Camera]], device: torch.device) -> Tables:
     """Lay out a batch: sets of so many Gaussians, each seen by its cameras."""
     flat = [camera for group in cameras for camera in group]
     owners = [index for index, group in enumerate(cameras) for _ in group]

@@ -1,5 +1,6 @@
 """The gsplat adapter's own arithmetic, with a stand-in that answers as gsplat 1.5.3 does: no GPU needed."""
 
+import builtins
 import sys
 import types
 
@@ -131,19 +132,6 @@ def test_what_is_missing_is_said(monkeypatch, scene, forgetful):
         adapter.rasterize_gsplat(*scene, None, 0.3, False, ())
 
 
-class Failing(types.ModuleType):
-    """A module that fails when something is wanted of it."""
-
-    def __init__(self, name, error):
-        super().__init__(name)
-        self.error = error
-
-    def __getattr__(self, name):
-        if name.startswith("__"):
-            raise AttributeError(name)
-        raise self.error
-
-
 @pytest.mark.parametrize(
     "error",
     [
@@ -157,12 +145,17 @@ class Failing(types.ModuleType):
 def test_what_keeps_gsplat_from_drawing_comes_with_advice(monkeypatch, forgetful, error):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     fakes = {name: types.ModuleType(name) for name in ("gsplat", "gsplat.cuda", "gsplat.cuda._backend")}
-    if error:
-        fakes["gsplat.cuda._backend"] = Failing("gsplat.cuda._backend", error)
-    else:
-        fakes["gsplat.cuda._backend"]._C = None
+    fakes["gsplat.cuda._backend"]._C = None
     for name, module in fakes.items():
         monkeypatch.setitem(sys.modules, name, module)
+
+    def fail(name, *more):
+        if error and name == "gsplat":
+            raise error
+        return find(name, *more)
+
+    find = builtins.__import__
+    monkeypatch.setattr(builtins, "__import__", fail)
     reason = str(error).splitlines()[0] if error else "it found no CUDA toolkit"
     with pytest.raises(ConfigError) as caught:
         adapter._load_gsplat()
