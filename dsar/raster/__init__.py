@@ -37,10 +37,10 @@ def rasterize(
             for images that are compared with block averages of larger ones.
         antialiased: lower opacities by what dilation adds in area, so that splats smaller than a pixel do not
             thicken as the camera moves away (Yu et al. 2024, Mip-Splatting).
-        backend: `cpu` (Numba, float32), `warp` (float32, for NVIDIA GPUs; on the CPU for tests only), `gsplat`
-            (float32, NVIDIA GPUs, needs a compiler), `reference` (plain torch, any dtype and device, a hundred
-            times slower), or `auto`: for float32 the fast one where the tensors are, `warp` before `gsplat`,
-            else `reference`.
+        backend: `cpu` (Numba, float32), `warp` (float32, for NVIDIA GPUs; on the CPU only for tests),
+            `gsplat` (float32, NVIDIA GPUs, needs a compiler), `reference` (plain torch, any dtype and device,
+            a hundred times slower), or `auto`: for float32 the fast one where the tensors are, `warp` before
+            `gsplat`, else `reference`.
         outputs: what to compute besides colour, alpha and expected depth.
 
     Returns:

@@ -128,7 +128,7 @@ def _choose_backend(backend: Backend, means: Tensor, cameras: Sequence[Sequence[
 
 
 def _fast_backend(device: str) -> Backend:
-    """Return the fast backend for a type of device that is installed; the reference where none is made for it.
+    """Return the installed fast backend for a type of device; the reference where none is made for it.
 
     Raises:
         MissingDependencyError: None of those for an NVIDIA GPU is installed.

@@ -94,9 +94,11 @@ def _check_backgrounds(backgrounds: Tensor, views: int, means: Tensor) -> None:
     """Raise ConfigError where there is not one colour a view, of the Gaussians' dtype."""
     if backgrounds.shape != (views, 3):
         raise ConfigError(
-            f"rasterize: {views} views have backgrounds of shape {(views, 3)}, found {tuple(backgrounds.shape)}"
+            f"rasterize: {views} views have backgrounds of shape {(views, 3)}, "
+            f"found {tuple(backgrounds.shape)}"
         )
     if backgrounds.dtype != means.dtype:
         raise ConfigError(
-            f"rasterize: backgrounds are {backgrounds.dtype}, Gaussians {means.dtype}; bring both to one dtype"
+            f"rasterize: backgrounds are {backgrounds.dtype}, Gaussians {means.dtype}; "
+            "bring both to one dtype"
         )

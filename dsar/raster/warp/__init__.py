@@ -1,8 +1,8 @@
 """The backend for GPUs that needs no compiler: Warp kernels under one autograd function, float32.
 
-A whole batch of views goes through every kernel at once. The host waits for the device once, for the number of
-pairs of tiles and splats; where contributors are asked for, once more. Images and gradients are the same to the
-bit in every run. On the CPU the same kernels run in the same blocks of threads, one after another: for tests.
+A whole batch of views goes through every kernel at once. The host waits for the device once, for the number
+of pairs of tiles and splats; where contributors are asked for, once more. Images and gradients are the same
+to the bit in every run. On the CPU the same kernels run in the same blocks of threads: for tests.
 """
 
 import dataclasses

@@ -45,8 +45,8 @@ def start_warp(device: torch.device) -> None:
     if device.type == "cuda" and not wp.is_cuda_available():
         driver = ".".join(map(str, wp.get_cuda_driver_version() or ("none",)))
         raise ConfigError(
-            f"rasterize: Warp {wp.config.version} does not find a CUDA driver that it can use (version found: "
-            f"{driver}); update NVIDIA's driver, or install gsplat and take backend='gsplat'"
+            f"rasterize: Warp {wp.config.version} does not find a CUDA driver that it can use (version "
+            f"found: {driver}); update NVIDIA's driver, or install gsplat and take backend='gsplat'"
         )
 
 

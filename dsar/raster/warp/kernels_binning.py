@@ -1,4 +1,4 @@
-"""Warp kernels: the list of pairs of a tile and a splat that touches it, and the sums over a splat's pairs."""
+"""Warp kernels: the pairs of a tile and a splat that touches it, and the sums over a splat's pairs."""
 
 import math
 from typing import no_type_check
@@ -8,7 +8,7 @@ import warp as wp  # pyright: ignore[reportMissingImports]  # optional
 from dsar.raster.conventions import ALPHA_MIN
 from dsar.raster.warp.compiling import func, kernel
 from dsar.raster.warp.kernels_projection import Record
-from dsar.raster.warp.tables import FIRST_INSTANCE, FIRST_TILE, HEIGHT, TILE, TILES_X, WIDTH
+from dsar.raster.warp.tables import FIRST_TILE, HEIGHT, TILE, TILES_X, WIDTH
 
 _LOG_ALPHA_MIN = wp.constant(math.log(ALPHA_MIN))
 _SLACK = wp.constant(1e-4)
@@ -48,8 +48,8 @@ def list_pairs(
 ):  # fmt: skip
     """Count the tiles that each instance touches; if `keys` is not empty, list them instead.
 
-    What has no pixel in its bounding box is marked as not drawable. Of each row of tiles those are listed that
-    the outline reaches.
+    What has no pixel in its bounding box is marked as not drawable. Of each row of tiles those are listed
+    that the outline reaches.
 
     Keys sort by tile, then by depth. One kernel does both, because another might round otherwise and find
     another number.

@@ -1,9 +1,9 @@
 """Warp kernels: splats blended front to back into the pixels of a tile, and the way back.
 
 A block of THREADS threads takes a tile, each thread PIXELS of its pixels. Splats come into the block's shared
-memory BATCH at a time. On the way back every thread adds up a splat's gradient over its pixels, the block adds
-up its threads', and one number leaves for each pair of a splat and a tile: no two blocks write to one place,
-so gradients are the same to the bit in every run.
+memory BATCH at a time. On the way back every thread adds up a splat's gradient over its pixels, the block
+adds up its threads', and one record leaves for each pair of a splat and a tile: no two blocks write to one
+place, so gradients are the same to the bit in every run.
 """
 
 import math

@@ -1,7 +1,7 @@
 """Warp kernels: Gaussians in the world to splats on the images. Warp derives the way back.
 
-A splat's record is mean x, mean y, stretch, shear, height, log opacity, red, green, blue and z. Its fall-off is
-the Cholesky factor of its inverse covariance: with d = mean - pixel,
+A splat's record is mean x, mean y, stretch, shear, height, log opacity, red, green, blue and z. Its fall-off
+is the Cholesky factor of its inverse covariance: with d = mean - pixel,
 
     e1 = stretch dx - shear dy,  e2 = height dy,  log alpha = log opacity - e1² - e2².
 

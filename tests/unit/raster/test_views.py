@@ -99,7 +99,7 @@ def test_batches_that_do_not_fit_are_refused():
         rasterize_views([gaussians] * 2, [[camera]])
     with pytest.raises(ConfigError, match=r"2 views have backgrounds of shape \(2, 3\), found \(1, 3\)"):
         rasterize_views([gaussians], [[camera] * 2], backgrounds=torch.zeros(1, 3))
-    with pytest.raises(ConfigError, match="backgrounds are torch.float64"):
+    with pytest.raises(ConfigError, match=r"backgrounds are torch\.float64"):
         rasterize(gaussians, camera, background=torch.zeros(3, dtype=torch.float64))
     more = dataclasses.replace(gaussians, harmonics=torch.zeros(1, 4, 3))
     with pytest.raises(ConfigError, match="equally many harmonics, found 1 and 4"):
