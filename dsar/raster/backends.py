@@ -71,11 +71,11 @@ def load_backend(
         case "warp":
             if find_spec("warp") is None:
                 raise MissingDependencyError("the warp backend of rasterize", "warp-lang", "gpu")
-            from dsar.raster.warp import rasterize_views_warp
+            from dsar.raster.warp_backend import rasterize_views_warp
 
             return rasterize_views_warp
         case "gsplat":
-            from dsar.raster.gsplat import rasterize_gsplat
+            from dsar.raster.gsplat_backend import rasterize_gsplat
 
             return _one_by_one(rasterize_gsplat)
         case _:

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from dsar.errors import ConfigError, MissingDependencyError
-from dsar.raster import gsplat as adapter
+from dsar.raster import gsplat_backend as adapter
 from dsar.raster.reference import _project, _radii, rasterize_reference
 from dsar.types import Camera, Gaussians
 

@@ -138,7 +138,7 @@ class CountWaits(TorchDispatchMode):
 
 @NEEDS_WARP
 def test_the_host_waits_once_for_a_whole_batch():
-    from dsar.raster.warp import rasterize_views_warp
+    from dsar.raster.warp_backend import rasterize_views_warp
 
     sets, views, backgrounds = make_batch()
     leaves, colors = leaves_of(sets, backgrounds)

@@ -24,7 +24,7 @@ def test_kernels_compile_for_a_gpu_without_its_driver(architecture, tmp_path):
     import warp as wp
 
     for name, kernels in KERNELS.items():
-        module = importlib.import_module(f"dsar.raster.warp.{name}")
+        module = importlib.import_module(f"dsar.raster.warp_backend.{name}")
         wp.compile_aot_module(module, arch=architecture, module_dir=tmp_path / name, use_ptx=True)
         (file,) = (tmp_path / name).rglob("*.ptx")
         text = file.read_text()
@@ -52,7 +52,7 @@ def test_a_gpu_gets_warp_then_gsplat_then_advice(monkeypatch):
 def test_a_driver_that_warp_cannot_use_is_named(monkeypatch):
     import warp as wp
 
-    from dsar.raster.warp.compiling import start_warp
+    from dsar.raster.warp_backend.compiling import start_warp
 
     monkeypatch.setattr(wp, "is_cuda_available", lambda: False)
     with pytest.raises(ConfigError, match="does not find a CUDA driver"):
@@ -61,7 +61,7 @@ def test_a_driver_that_warp_cannot_use_is_named(monkeypatch):
 
 @NEEDS_WARP
 def test_a_list_of_tiles_that_would_not_fit_is_refused(monkeypatch):
-    from dsar.raster.warp import splats
+    from dsar.raster.warp_backend import splats
 
     monkeypatch.setattr(splats, "_MAX_PAIRS", 11)
     wall = one_gaussian(scales=torch.full((1, 3), 50.0))

@@ -15,8 +15,8 @@ from typing import no_type_check
 import warp as wp  # pyright: ignore[reportMissingImports]  # optional
 
 from dsar.raster.conventions import ALPHA_MIN, FRUSTUM_MARGIN, NEAR
-from dsar.raster.warp.compiling import differentiable_kernel, func, kernel
-from dsar.raster.warp.tables import (
+from dsar.raster.warp_backend.compiling import differentiable_kernel, func, kernel
+from dsar.raster.warp_backend.tables import (
     CENTER,
     FIRST_GAUSSIAN,
     FIRST_INSTANCE,

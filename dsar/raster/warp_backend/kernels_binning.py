@@ -6,9 +6,9 @@ from typing import no_type_check
 import warp as wp  # pyright: ignore[reportMissingImports]  # optional
 
 from dsar.raster.conventions import ALPHA_MIN
-from dsar.raster.warp.compiling import func, kernel
-from dsar.raster.warp.kernels_projection import Record
-from dsar.raster.warp.tables import FIRST_TILE, HEIGHT, TILE, TILES_X, WIDTH
+from dsar.raster.warp_backend.compiling import func, kernel
+from dsar.raster.warp_backend.kernels_projection import Record
+from dsar.raster.warp_backend.tables import FIRST_TILE, HEIGHT, TILE, TILES_X, WIDTH
 
 _LOG_ALPHA_MIN = wp.constant(math.log(ALPHA_MIN))
 _SLACK = wp.constant(1e-4)

@@ -14,12 +14,12 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from dsar.raster.warp.compiling import launch, start_warp
-from dsar.raster.warp.extras import cut_images, draw_extras
-from dsar.raster.warp.kernels_compositing import THREADS, composite, composite_backward
-from dsar.raster.warp.kernels_projection import RECORD_SIZE
-from dsar.raster.warp.splats import differentiate_splats, make_splats
-from dsar.raster.warp.tables import make_tables
+from dsar.raster.warp_backend.compiling import launch, start_warp
+from dsar.raster.warp_backend.extras import cut_images, draw_extras
+from dsar.raster.warp_backend.kernels_compositing import THREADS, composite, composite_backward
+from dsar.raster.warp_backend.kernels_projection import RECORD_SIZE
+from dsar.raster.warp_backend.splats import differentiate_splats, make_splats
+from dsar.raster.warp_backend.tables import make_tables
 from dsar.types import Camera, Gaussians, RenderOutput
 
 
@@ -46,9 +46,11 @@ def rasterize_views_warp(
     if backgrounds is None:
         backgrounds = splats.records.new_zeros(len(tables.sizes), 3)
     flat: Any = _Blend.apply(*fields, backgrounds, splats)
-    images = zip(*(cut_images(image, tables) for image in flat), strict=True)
-    outputs_by_view = zip(images, splats.culled().unbind(), draw_extras(splats, outputs), strict=True)
-    views = iter(RenderOutput(*image, culled, **extras) for image, culled, extras in outputs_by_view)
+    images = (cut_images(image, tables) for image in flat)
+    parts = zip(*images, splats.culled().unbind(), draw_extras(splats, outputs), strict=True)
+    views = iter(
+        RenderOutput(color, alpha, depth, culled, **extras) for color, alpha, depth, culled, extras in parts
+    )
     return [[next(views) for _ in group] for group in cameras]
 
 

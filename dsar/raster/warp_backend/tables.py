@@ -80,15 +80,21 @@ def make_tables(counts: Sequence[int], cameras: Sequence[Sequence[Camera]], devi
     parts = [views, tiles[1:], pixels, instances, sets[1:], _bounds([len(group) for group in cameras])]
     # In one piece, so that one copy brings all to the device.
     packed = torch.tensor([value for part in parts for value in part], dtype=torch.int32).to(device)
-    table, *rest = packed.split([len(part) for part in parts])
+    table, tile_ends, pixel_bounds, instance_bounds, set_ends, first_views = packed.split(
+        [len(part) for part in parts]
+    )
     return Tables(
-        tuple((camera.height, camera.width) for camera in flat),
-        sets[-1],
-        instances[-1],
-        tiles[-1],
-        table.view(len(flat), len(columns)),
-        *rest,
-        torch.stack([_pack_camera(camera) for camera in flat]).to(device),
+        sizes=tuple((camera.height, camera.width) for camera in flat),
+        gaussians=sets[-1],
+        instances=instances[-1],
+        tiles=tiles[-1],
+        views=table.view(len(flat), len(columns)),
+        tile_ends=tile_ends,
+        pixel_bounds=pixel_bounds,
+        instance_bounds=instance_bounds,
+        set_ends=set_ends,
+        first_views=first_views,
+        cameras=torch.stack([_pack_camera(camera) for camera in flat]).to(device),
     )
 
 

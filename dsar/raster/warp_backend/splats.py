@@ -8,10 +8,10 @@ from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
 from dsar.errors import RasterError
-from dsar.raster.warp.compiling import launch, launch_adjoint
-from dsar.raster.warp.kernels_binning import list_pairs, sum_pairs
-from dsar.raster.warp.kernels_projection import RECORD_SIZE, find_drawable, make_records
-from dsar.raster.warp.tables import Tables
+from dsar.raster.warp_backend.compiling import launch, launch_adjoint
+from dsar.raster.warp_backend.kernels_binning import list_pairs, sum_pairs
+from dsar.raster.warp_backend.kernels_projection import RECORD_SIZE, find_drawable, make_records
+from dsar.raster.warp_backend.tables import Tables
 
 _MAX_PAIRS = 2**28
 """Of splats and tiles. So many take 16 GB, and a backward pass 11 GB more."""

@@ -7,11 +7,11 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 
-from dsar.raster.warp.compiling import launch
-from dsar.raster.warp.kernels_compositing import THREADS
-from dsar.raster.warp.kernels_extras import composite_extras
-from dsar.raster.warp.splats import Splats
-from dsar.raster.warp.tables import Tables
+from dsar.raster.warp_backend.compiling import launch
+from dsar.raster.warp_backend.kernels_compositing import THREADS
+from dsar.raster.warp_backend.kernels_extras import composite_extras
+from dsar.raster.warp_backend.splats import Splats
+from dsar.raster.warp_backend.tables import Tables
 from dsar.types import Contributors
 
 

@@ -4,8 +4,8 @@ from typing import no_type_check
 
 import warp as wp  # pyright: ignore[reportMissingImports]  # optional
 
-from dsar.raster.warp.compiling import kernel
-from dsar.raster.warp.kernels_compositing import (
+from dsar.raster.warp_backend.compiling import kernel
+from dsar.raster.warp_backend.kernels_compositing import (
     ALPHA_MAX_F,
     BATCH,
     LOG_ALPHA_MIN,
@@ -19,8 +19,8 @@ from dsar.raster.warp.kernels_compositing import (
     pixel_place,
     tile_corner,
 )
-from dsar.raster.warp.kernels_projection import Record
-from dsar.raster.warp.tables import FIRST_INSTANCE
+from dsar.raster.warp_backend.kernels_projection import Record
+from dsar.raster.warp_backend.tables import FIRST_INSTANCE
 
 # For kernels that are compiled ahead of time; a launch says it itself.
 wp.set_module_options({"block_dim": THREADS})
