@@ -42,13 +42,15 @@ def check_inputs(
 
 def _check_camera(camera: Camera) -> None:
     """Raise CaptureError where a camera is not a plain pinhole."""
-    (fx, skew, _), (shear, fy, _), bottom = camera.K.tolist()
+    # As lists: on so few numbers Python is faster than torch.
+    K, transform = camera.K.tolist(), camera.T_camera_world.tolist()
+    (fx, skew, _), (shear, fy, _), bottom = K
     if skew != 0 or shear != 0 or bottom != [0, 0, 1] or not (fx > 0 and fy > 0):
         raise CaptureError(
             f"camera {camera.name!r}: K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0, found "
-            f"{camera.K.tolist()}; undistort and rectify the images first"
+            f"{K}; undistort and rectify the images first"
         )
-    if not (camera.K.isfinite().all() and camera.T_camera_world.isfinite().all()):
+    if not all(math.isfinite(value) for row in (*K, *transform) for value in row):
         raise CaptureError(f"camera {camera.name!r}: K or T_camera_world holds values that are not finite")
     if camera.width < 1 or camera.height < 1:
         raise CaptureError(f"camera {camera.name!r}: its image has {camera.width} x {camera.height} pixels")

@@ -34,14 +34,14 @@ def rasterize_views_warp(
     """Rasterise with Warp: `dsar.raster.rasterize_views` without its checks, for float32.
 
     Raises:
-        ConfigError: Warp cannot use the GPU.
+        ConfigError: Warp is too old, or cannot use the GPU.
         RasterError: The list of tiles would not fit into memory.
     """
     device = gaussians[0].means.device
     start_warp(device)
     tables = make_tables([len(group) for group in gaussians], cameras, device)
     names = [field.name for field in dataclasses.fields(Gaussians)]
-    fields = [torch.cat([getattr(group, name) for group in gaussians]) for name in names]
+    fields = [_join([getattr(group, name) for group in gaussians]) for name in names]
     splats = make_splats([field.detach() for field in fields], tables, dilation, antialiased)
     if backgrounds is None:
         backgrounds = splats.records.new_zeros(len(tables.sizes), 3)
@@ -52,6 +52,11 @@ def rasterize_views_warp(
         RenderOutput(color, alpha, depth, culled, **extras) for color, alpha, depth, culled, extras in parts
     )
     return [[next(views) for _ in group] for group in cameras]
+
+
+def _join(parts: Sequence[Tensor]) -> Tensor:
+    """Return the rows of all sets one after another, without a copy where there is only one set."""
+    return torch.cat(list(parts)) if len(parts) > 1 else parts[0].contiguous()
 
 
 class _Blend(torch.autograd.Function):

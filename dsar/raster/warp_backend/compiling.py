@@ -1,5 +1,6 @@
 """How Warp compiles the kernels, and starts one where torch's tensors are."""
 
+import logging
 from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any
@@ -9,6 +10,8 @@ import warp as wp  # pyright: ignore[reportMissingImports]  # optional
 from torch import Tensor
 
 from dsar.errors import ConfigError
+
+_log = logging.getLogger(__name__)
 
 
 def func(function: Callable[..., Any]) -> Any:
@@ -39,7 +42,7 @@ def start_warp(device: torch.device) -> None:
     """Make Warp ready for a device.
 
     Raises:
-        ConfigError: It cannot use the GPU.
+        ConfigError: It is too old, or cannot use the GPU.
     """
     _start_warp()
     if device.type == "cuda" and not wp.is_cuda_available():
@@ -56,6 +59,13 @@ def _start_warp() -> None:
 
     Without the latter a block on the CPU is one thread, and what threads do together would remain untried.
     """
+    if not hasattr(wp.config, "enable_cpu_blocks"):
+        raise ConfigError(
+            f"rasterize: Warp {wp.config.version} is too old; pip install --upgrade 'dsar-avatar[gpu]'"
+        )
+    _log.info(
+        "Loading the rasteriser's Warp kernels; their first use on a machine compiles them (about 30 s)"
+    )
     wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
     wp.config.enable_cpu_blocks = True
     wp.init()

@@ -94,7 +94,7 @@ def make_tables(counts: Sequence[int], cameras: Sequence[Sequence[Camera]], devi
         instance_bounds=instance_bounds,
         set_ends=set_ends,
         first_views=first_views,
-        cameras=torch.stack([_pack_camera(camera) for camera in flat]).to(device),
+        cameras=torch.tensor([_pack_camera(camera) for camera in flat], dtype=torch.float32).to(device),
     )
 
 
@@ -103,9 +103,12 @@ def _bounds(counts: Sequence[int]) -> list[int]:
     return list(accumulate(counts, initial=0))
 
 
-def _pack_camera(camera: Camera) -> Float[Tensor, "19"]:
-    """Return a camera as the kernels take it, in main memory."""
-    transform, K = (t.detach().double().cpu() for t in (camera.T_camera_world, camera.K))
-    rotation, translation = transform[:3, :3], transform[:3, 3]
-    intrinsics = K[[0, 1, 0, 1], [0, 1, 2, 2]]
-    return torch.cat([rotation.flatten(), translation, intrinsics, -rotation.T @ translation]).float()
+def _pack_camera(camera: Camera) -> list[float]:
+    """Return a camera's row of the table."""
+    # As lists: on so few numbers Python is faster than torch.
+    (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
+    rows = camera.T_camera_world.tolist()[:3]
+    rotation = [value for row in rows for value in row[:3]]
+    translation = [row[3] for row in rows]
+    center = [-sum(row[axis] * row[3] for row in rows) for axis in range(3)]
+    return [*rotation, *translation, fx, fy, cx, cy, *center]
