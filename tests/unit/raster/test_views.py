@@ -146,3 +146,27 @@ def test_the_host_waits_once_for_a_whole_batch():
         outputs = rasterize_views_warp(leaves, views, colors, 0.3, False, ())
         weigh([output for group in outputs for output in group]).backward()
     assert waits.count == 1
+
+
+@NEEDS_WARP
+def test_a_batch_needs_no_more_launches_than_one_view(monkeypatch):
+    import warp as wp
+
+    started = []
+
+    def count(launch):
+        return lambda *arguments, **options: started.append(1) or launch(*arguments, **options)
+
+    for name in ("launch", "launch_tiled"):
+        monkeypatch.setattr(wp, name, count(getattr(wp, name)))
+    sets, views, _ = make_batch()
+    numbers = []
+    for these, those in ((sets, views), (sets[:1], [views[0][:1]])):
+        outputs = rasterize_views(
+            [group.map(torch.Tensor.requires_grad_) for group in these], those, backend="warp"
+        )
+        forward = len(started)
+        weigh([output for group in outputs for output in group]).backward()
+        numbers.append((forward, len(started) - forward))
+        started.clear()
+    assert numbers == [(5, 3), (5, 3)]
