@@ -12,6 +12,7 @@ from dsar.errors import ConfigError, MissingDependencyError
 from dsar.types import Camera, Gaussians, RenderOutput
 
 Backend = Literal["auto", "cpu", "warp", "gsplat", "reference"]
+BACKENDS: tuple[Backend, ...] = get_args(Backend)
 Output = Literal["median_depth", "first_hit_depth", "largest_weight_id", "contributors"]
 OUTPUTS: tuple[Output, ...] = get_args(Output)
 
@@ -109,6 +110,8 @@ def _one_by_one(draw: ViewRasterizer) -> Rasterizer:
 
 def _choose_backend(backend: Backend, means: Tensor, cameras: Sequence[Sequence[Camera]]) -> Backend:
     """Return the fast backend of the tensors' device for float32, the reference for all else."""
+    if backend not in BACKENDS:
+        raise ConfigError(f"rasterize: backend can be {', '.join(BACKENDS)}; found {backend}")
     device = means.device.type
     if backend == "auto":
         backend = _fast_backend(device) if means.dtype == torch.float32 else "reference"
