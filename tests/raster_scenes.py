@@ -1,6 +1,7 @@
 """Gaussians and cameras to rasterise, and how the backends are run and compared."""
 
 import dataclasses
+import importlib.util
 import math
 
 import pytest
@@ -13,10 +14,22 @@ from dsar.types import Camera, Gaussians
 FIELDS = ("means", "rotations", "scales", "opacities", "harmonics")
 
 
-CUDA = pytest.param("cuda", marks=pytest.mark.gpu)
+def needs(module, package, extra):
+    """Skip where a module is not installed."""
+    reason = f"{package} is not installed: pip install 'dsar-avatar[{extra}]'"
+    return pytest.mark.skipif(importlib.util.find_spec(module) is None, reason=reason)
 
 
-FAST = ("cpu", CUDA)
+NEEDS_WARP = needs("warp", "warp-lang", "gpu")
+WARP = pytest.param("warp", marks=NEEDS_WARP)
+"""On the CPU, where the same kernels run in the same blocks of threads."""
+ON_GPU = (
+    pytest.param("warp on a GPU", marks=(pytest.mark.gpu, NEEDS_WARP)),
+    pytest.param("gsplat", marks=(pytest.mark.gpu, needs("gsplat", "gsplat", "gsplat"))),
+)
+
+
+FAST = ("cpu", WARP, *ON_GPU)
 
 
 BACKENDS = ("reference", *FAST)
@@ -32,8 +45,8 @@ def on(device, record):
 
 def draw(gaussians, camera, backend, background=None, **options):
     """Rasterise where a backend wants its tensors; return the images in main memory."""
-    device = "cuda" if backend == "cuda" else "cpu"
-    background = on(device, background)
+    device = "cuda" if backend in ("warp on a GPU", "gsplat") else "cpu"
+    background, backend = on(device, background), backend.removesuffix(" on a GPU")
     output = rasterize(on(device, gaussians), camera, background=background, backend=backend, **options)
     return on("cpu", output)
 

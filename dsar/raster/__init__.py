@@ -1,6 +1,6 @@
 """Gaussians to images: one function, several backends with the same meaning."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 
 from jaxtyping import Float
 from torch import Tensor
@@ -10,7 +10,7 @@ from dsar.raster.checks import check_inputs
 from dsar.raster.conventions import EPS_2D
 from dsar.types import Camera, Gaussians, RenderOutput
 
-__all__ = ["Backend", "Output", "rasterize", "reduced_dilation"]
+__all__ = ["Backend", "Output", "rasterize", "rasterize_views", "reduced_dilation"]
 
 
 def rasterize(
@@ -37,9 +37,10 @@ def rasterize(
             for images that are compared with block averages of larger ones.
         antialiased: lower opacities by what dilation adds in area, so that splats smaller than a pixel do not
             thicken as the camera moves away (Yu et al. 2024, Mip-Splatting).
-        backend: `cpu` (Numba, float32), `cuda` (gsplat, float32), `reference` (plain torch, any dtype and
-            device, a hundred times slower), or `auto`: for float32 the fast one where the tensors are, else
-            `reference`.
+        backend: `cpu` (Numba, float32), `warp` (float32, for NVIDIA GPUs; on the CPU only for tests),
+            `gsplat` (float32, NVIDIA GPUs, needs a compiler), `reference` (plain torch, any dtype and device,
+            a hundred times slower), or `auto`: for float32 the fast one where the tensors are, `warp` before
+            `gsplat`, else `reference`.
         outputs: what to compute besides colour, alpha and expected depth.
 
     Returns:
@@ -49,10 +50,60 @@ def rasterize(
         ConfigError: the tensors do not fit each other or the backend, or a setting is not usable.
         CaptureError: the camera has skew, no positive focal length, no pixels, or values that are not finite.
         RasterError: Gaussians are so large that their list of tiles would not fit into memory.
+        MissingDependencyError: the backend is not installed, or none for the GPU is.
     """
-    check_inputs(gaussians, camera, background, dilation, outputs)
-    draw = load_backend(backend, gaussians.means, camera)
-    return draw(gaussians, camera, background, dilation, antialiased, outputs)
+    views = rasterize_views(
+        [gaussians],
+        [[camera]],
+        backgrounds=None if background is None else background[None],
+        dilation=dilation,
+        antialiased=antialiased,
+        backend=backend,
+        outputs=outputs,
+    )
+    return views[0][0]
+
+
+def rasterize_views(
+    gaussians: Sequence[Gaussians],
+    cameras: Sequence[Sequence[Camera]],
+    *,
+    backgrounds: Float[Tensor, "v 3"] | None = None,
+    dilation: float = EPS_2D,
+    antialiased: bool = False,
+    backend: Backend = "auto",
+    outputs: Collection[Output] = (),
+) -> list[list[RenderOutput]]:
+    """Rasterise several sets of Gaussians, each in views of its own, in one call: `rasterize` for a batch.
+
+    `warp` draws all of them at once, which keeps a GPU busy with small images; other backends one by one. The
+    meaning is the same: each image equals that of a `rasterize` of its own.
+
+    Args:
+        gaussians: the sets, of any sizes, with equally many harmonics.
+        cameras: for each set those that see it: any number, images of any sizes.
+        backgrounds: one sRGB colour a view, in the order of the cameras.
+        dilation: as for `rasterize`, likewise the rest.
+        antialiased: see there.
+        backend: see there.
+        outputs: see there.
+
+    Returns:
+        The images of each set, in the order of its cameras.
+
+    Raises:
+        ConfigError: as `rasterize`, or sets, cameras and backgrounds are not equally many.
+        CaptureError: as `rasterize`.
+        RasterError: as `rasterize`.
+        MissingDependencyError: as `rasterize`.
+    """
+    check_inputs(gaussians, cameras, backgrounds, dilation, outputs)
+    if not any(cameras):
+        return [[] for _ in cameras]
+    if backgrounds is not None:
+        backgrounds = backgrounds.to(gaussians[0].means.device)
+    draw = load_backend(backend, gaussians, cameras)
+    return draw(gaussians, cameras, backgrounds, dilation, antialiased, outputs)
 
 
 def reduced_dilation(factor: int) -> float:

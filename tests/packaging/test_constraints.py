@@ -38,7 +38,7 @@ def list_dependencies(extras):
 
 def test_every_dependency_is_pinned_exactly():
     constraints = read_constraints()
-    assert list_dependencies(["", "dev"]) - constraints.keys() == set()
+    assert list_dependencies(["", "dev", "gpu"]) - constraints.keys() == set()
     assert all(str(r.specifier).startswith("==") for r in constraints.values())
 
 

@@ -3,7 +3,7 @@ import sys
 
 import pytest
 
-HEAVY = ("pxr", "mitsuba", "drjit", "OpenEXR", "OpenImageIO", "gsplat", "fourdgs", "gsply", "plyfile")
+HEAVY = ("pxr", "mitsuba", "drjit", "OpenEXR", "OpenImageIO", "gsplat", "warp", "fourdgs", "gsply", "plyfile")
 
 
 @pytest.mark.parametrize("package", ["dsar", "dsar_exporters", "dsar_render"])

@@ -3,11 +3,13 @@
 import dataclasses
 import math
 
+import pytest
 import torch
 from hypothesis import event, given, settings
 from hypothesis import strategies as st
+from raster_scenes import WARP
 
-from dsar.raster import rasterize
+from dsar.raster import rasterize_views
 from dsar.types import Camera, Gaussians
 
 FIELDS = tuple(field.name for field in dataclasses.fields(Gaussians))
@@ -36,9 +38,9 @@ def cameras(draw):
 
 
 @st.composite
-def scenes(draw):
+def scenes(draw, most=150, ks=(1, 4, 9, 16)):
     """Draw Gaussians in front of, beside and behind such a camera; some are spoilt."""
-    count, k = draw(st.integers(0, 150)), draw(st.sampled_from([1, 4, 9, 16]))
+    count, k = draw(st.integers(0, most)), draw(st.sampled_from(ks))
     generator = torch.Generator().manual_seed(draw(st.integers(0, 2**31)))
 
     def uniform(*shape):
@@ -59,23 +61,36 @@ def scenes(draw):
     return gaussians
 
 
-def draw_and_differentiate(gaussians, camera, backend, dtype, antialiased):
-    leaves = gaussians.map(lambda values: values.to(dtype).requires_grad_())
-    output = rasterize(leaves, camera, backend=backend, antialiased=antialiased, outputs=EXTRAS)
+@st.composite
+def batches(draw):
+    """Draw sets of Gaussians and the cameras of each, none for some; at least one in all."""
+    ks = [draw(st.sampled_from([1, 4, 9, 16]))]
+    sets = draw(st.lists(scenes(80, ks), min_size=1, max_size=3))
+    views = [draw(st.lists(cameras(), max_size=3)) for _ in sets]
+    return sets, views if any(views) else [[draw(cameras())], *views[1:]]
+
+
+def weigh(output, dtype):
+    """Return a fixed random weighting of all of an image."""
     # Depth is a quotient by alpha: its gradient is as inexact as a faint pixel's alpha, one minus nearly one.
     images = (output.color, output.alpha, output.depth * output.alpha.detach())
     generator = torch.Generator().manual_seed(1)
     weights = [torch.randn(image.shape, generator=generator).to(dtype) for image in images]
-    loss = torch.stack([(image * weight).sum() for image, weight in zip(images, weights, strict=True)]).sum()
-    fields = [getattr(leaves, field) for field in FIELDS]
-    return output, torch.autograd.grad(loss, fields, materialize_grads=True)
+    return torch.stack([(image * weight).sum() for image, weight in zip(images, weights, strict=True)]).sum()
 
 
-@settings(max_examples=60, deadline=None)
-@given(gaussians=scenes(), camera=cameras(), antialiased=st.booleans())
-def test_fast_equals_slow_on_any_scene(gaussians, camera, antialiased):
-    slow, slow_gradients = draw_and_differentiate(gaussians, camera, "reference", torch.float64, antialiased)
-    fast, fast_gradients = draw_and_differentiate(gaussians, camera, "cpu", torch.float32, antialiased)
+def draw_and_differentiate(sets, views, backend, dtype, **options):
+    """Return the images of each set, and the gradients of its fields."""
+    leaves = [group.map(lambda values: values.to(dtype, copy=True).requires_grad_()) for group in sets]
+    outputs = rasterize_views(leaves, views, backend=backend, outputs=EXTRAS, **options)
+    loss = torch.stack([weigh(output, dtype) for group in outputs for output in group]).sum()
+    fields = [getattr(group, field) for group in leaves for field in FIELDS]
+    gradients = iter(torch.autograd.grad(loss, fields, materialize_grads=True))
+    return outputs, [[next(gradients) for _ in FIELDS] for _ in sets]
+
+
+def assert_same_view(fast, slow):
+    """Compare two images; return whether every pixel blends the same number of fragments."""
     # A fragment right at a cut-off (alpha of 1/255, transmittance of 1e-4) may fall on either side of it.
     same = slow.contributors.counts == fast.contributors.counts
     assert (~same).sum() <= 1 + 0.002 * same.numel()
@@ -88,11 +103,47 @@ def test_fast_equals_slow_on_any_scene(gaussians, camera, antialiased):
     # Where the quotient of depth is well conditioned.
     solid = same & (slow.alpha > 0.05)
     assert ((fast.depth - slow.depth).abs()[solid] <= 1e-4 * slow.depth[solid]).all()
-    event("every pixel blends the same number of fragments" if same.all() else "a fragment fell at a cut-off")
-    for field, one, other in zip(FIELDS, fast_gradients, slow_gradients, strict=True):
+    if same.all():
+        assert torch.equal(fast.contributors.ids, slow.contributors.ids)
+        assert ((fast.contributors.weights - slow.contributors.weights).abs() <= 1e-4).all()
+    return bool(same.all())
+
+
+def assert_same_gradients(fast, slow, same):
+    """Compare gradients of fields where images blend the same fragments."""
+    for field, one, other in zip(FIELDS, fast, slow, strict=True):
         assert one.isfinite().all(), field
-        if same.all():
-            assert torch.equal(fast.contributors.ids, slow.contributors.ids)
-            assert ((fast.contributors.weights - slow.contributors.weights).abs() <= 1e-4).all()
-            # Rotations of a round Gaussian have no gradient; of terms around 10 float32 leaves this much.
-            assert (one - other).norm() <= 1e-3 * other.norm() + 1e-4, field
+        # Rotations of a round Gaussian have no gradient; of terms around 10 float32 leaves this much.
+        assert not same or (one - other).norm() <= 1e-3 * other.norm() + 1e-4, field
+
+
+@pytest.mark.parametrize("backend", ["cpu", WARP])
+@settings(max_examples=60, deadline=None)
+@given(
+    gaussians=scenes(),
+    camera=cameras(),
+    antialiased=st.booleans(),
+    dilation=st.sampled_from([0.1375, 0.3, 2.0]),
+)
+def test_fast_equals_slow_on_any_scene(backend, gaussians, camera, antialiased, dilation):
+    given_ = [gaussians], [[camera]]
+    options = {"antialiased": antialiased, "dilation": dilation}
+    ((slow,),), (slow_gradients,) = draw_and_differentiate(*given_, "reference", torch.float64, **options)
+    ((fast,),), (fast_gradients,) = draw_and_differentiate(*given_, backend, torch.float32, **options)
+    same = assert_same_view(fast, slow)
+    event("every pixel blends the same number of fragments" if same else "a fragment fell at a cut-off")
+    assert_same_gradients(fast_gradients, slow_gradients, same)
+
+
+@pytest.mark.parametrize("backend", ["cpu", WARP])
+@settings(max_examples=25, deadline=None)
+@given(batch=batches(), antialiased=st.booleans())
+def test_fast_equals_slow_on_any_batch(backend, batch, antialiased):
+    slow, slow_gradients = draw_and_differentiate(*batch, "reference", torch.float64, antialiased=antialiased)
+    fast, fast_gradients = draw_and_differentiate(*batch, backend, torch.float32, antialiased=antialiased)
+    assert [len(group) for group in fast] == [len(views) for views in batch[1]]
+    for ones, others, gradients, true_gradients in zip(
+        fast, slow, fast_gradients, slow_gradients, strict=True
+    ):
+        same = [assert_same_view(one, other) for one, other in zip(ones, others, strict=True)]
+        assert_same_gradients(gradients, true_gradients, all(same))

@@ -6,6 +6,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from raster_scenes import WARP
 
 from dsar.geometry.harmonics import rotate_harmonics
 from dsar.geometry.rotations import matrix_from_quaternion, quaternion_multiply
@@ -38,7 +39,7 @@ def assert_same_image(one, other, tolerance):
     assert error.max() < 0.01
 
 
-@pytest.mark.parametrize("backend", ["reference", "cpu"])
+@pytest.mark.parametrize("backend", ["reference", "cpu", WARP])
 @settings(max_examples=8, deadline=None)
 @given(seed=SEEDS)
 def test_order_of_gaussians_does_not_matter(backend, seed):
@@ -49,7 +50,7 @@ def test_order_of_gaussians_does_not_matter(backend, seed):
     assert_same_image(image, shuffled, 1e-6)
 
 
-@pytest.mark.parametrize("backend", ["reference", "cpu"])
+@pytest.mark.parametrize("backend", ["reference", "cpu", WARP])
 @settings(max_examples=8, deadline=None)
 @given(seed=SEEDS)
 def test_moving_scene_and_camera_together_does_not_matter(backend, seed):
@@ -73,9 +74,10 @@ def test_moving_scene_and_camera_together_does_not_matter(backend, seed):
     assert_same_image(image, moved_image, 1e-4)
 
 
+@pytest.mark.parametrize("backend", ["cpu", WARP])
 @settings(max_examples=15, deadline=None)
 @given(seed=SEEDS, k=st.sampled_from([1, 4, 9, 16]))
-def test_alpha_and_color_stay_in_range_and_gradients_stay_finite(seed, k):
+def test_alpha_and_color_stay_in_range_and_gradients_stay_finite(backend, seed, k):
     gaussians, camera = make_scene(seed)
     generator = torch.Generator().manual_seed(seed)
     wild = dataclasses.replace(
@@ -84,7 +86,7 @@ def test_alpha_and_color_stay_in_range_and_gradients_stay_finite(seed, k):
         scales=10 ** (8 * torch.rand(80, 3, generator=generator) - 5),
         harmonics=torch.randn(80, k, 3, generator=generator),
     ).map(torch.Tensor.requires_grad_)
-    output = rasterize(wild, camera)
+    output = rasterize(wild, camera, backend=backend)
     assert output.alpha.min() >= 0
     assert output.alpha.max() <= 1
     assert output.color.min() >= 0

@@ -1,6 +1,7 @@
 """What is left out of an image, and what is refused."""
 
 import dataclasses
+import inspect
 import math
 
 import pytest
@@ -18,7 +19,7 @@ from raster_scenes import (
 )
 
 from dsar.errors import CaptureError, ConfigError, RasterError
-from dsar.raster import cpu, rasterize
+from dsar.raster import backends, cpu, rasterize
 from dsar.raster.checks import check_outputs
 
 
@@ -77,5 +78,8 @@ def test_inputs_that_do_not_fit_are_refused():
         match="outputs can be median_depth, first_hit_depth, largest_weight_id, contributors; found normals",
     ):
         check_outputs(["normals"])
+    with pytest.raises(ConfigError, match="backend can be auto, cpu, warp, gsplat, reference; found cuda"):
+        # Past the check of types, which only tests have.
+        inspect.unwrap(backends._choose_backend)("cuda", gaussians.means, [[camera]])
     with pytest.raises(ConfigError, match="float32 tensors on a GPU, not"):
-        rasterize(gaussians, camera, backend="cuda")
+        rasterize(gaussians, camera, backend="gsplat")

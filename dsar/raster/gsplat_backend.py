@@ -1,4 +1,4 @@
-"""The fast backend on NVIDIA GPUs: gsplat (Apache-2.0) behind the same signature, float32.
+"""The optional backend on NVIDIA GPUs: gsplat (Apache-2.0) behind the same signature, float32.
 
 gsplat is imported at the first image, and compiles its kernels at the first ever (minutes, with nvcc). Its
 constants are those of dsar.raster.conventions; its version is pinned, because 1.6 changed some of them. It
@@ -21,7 +21,7 @@ from dsar.raster.reference import rasterize_reference
 from dsar.types import Camera, Contributors, Gaussians, RenderOutput
 
 
-def rasterize_cuda(
+def rasterize_gsplat(
     gaussians: Gaussians,
     camera: Camera,
     background: Float[Tensor, "3"] | None,
@@ -32,7 +32,7 @@ def rasterize_cuda(
     """Rasterise with gsplat: `dsar.raster.rasterize` without its checks, for float32 on a GPU.
 
     Raises:
-        ConfigError: there is no GPU, or no CUDA toolkit for gsplat's first use.
+        ConfigError: there is no GPU, or gsplat cannot build or load its kernels.
         MissingDependencyError: gsplat is not installed or does not import.
     """
     if not len(gaussians):
@@ -80,19 +80,32 @@ def _load_gsplat() -> Any:
     # Before the import, which on a machine without a GPU fails in ways that differ from one to the next.
     if not torch.cuda.is_available():
         raise ConfigError(
-            "rasterize: the cuda backend needs an NVIDIA GPU and a CUDA build of torch; none found"
+            "rasterize: the gsplat backend needs an NVIDIA GPU and a CUDA build of torch; none found"
         )
     try:
         import gsplat  # pyright: ignore[reportMissingImports]  # not where CI runs
         from gsplat.cuda._backend import _C  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise MissingDependencyError("the cuda backend of rasterize", "gsplat", "gpu") from error
+    except ModuleNotFoundError as error:
+        if error.name != "gsplat":
+            raise _broken(error) from error
+        raise MissingDependencyError("the gsplat backend of rasterize", "gsplat", "gsplat") from error
+    # Without its kernels, gsplat fails in whatever line first wants them; a compiler's failure comes through
+    # torch as RuntimeError.
+    except (ImportError, AttributeError, RuntimeError, OSError) as error:
+        raise _broken(error) from error
     if _C is None:
-        raise ConfigError(
-            "rasterize: gsplat found no CUDA toolkit to compile its kernels with; put nvcc on PATH or set "
-            "CUDA_HOME"
-        )
+        raise _broken("it found no CUDA toolkit")
     return gsplat
+
+
+def _broken(reason: object) -> ConfigError:
+    """Return the error that says why gsplat is here and does not draw, and what to do."""
+    first = next(iter(str(reason).splitlines()), "") or repr(reason)
+    return ConfigError(
+        f"rasterize: gsplat could not build or load its kernels ({first}); it needs nvcc of CUDA "
+        f"{torch.version.cuda} on PATH or in CUDA_HOME, a C++ compiler and ninja. "
+        "pip install 'dsar-avatar[gpu]' brings Warp, which needs none of them (backend='warp')"
+    )
 
 
 def _hide_invalid(gaussians: Gaussians) -> Gaussians:

@@ -1,5 +1,6 @@
 """The gsplat adapter's own arithmetic, with a stand-in that answers as gsplat 1.5.3 does: no GPU needed."""
 
+import builtins
 import sys
 import types
 
@@ -7,7 +8,7 @@ import pytest
 import torch
 
 from dsar.errors import ConfigError, MissingDependencyError
-from dsar.raster import cuda, rasterize
+from dsar.raster import gsplat_backend as adapter
 from dsar.raster.reference import _project, _radii, rasterize_reference
 from dsar.types import Camera, Gaussians
 
@@ -90,8 +91,8 @@ def test_adapter_returns_what_the_reference_does(monkeypatch, scene, antialiased
     gaussians = gaussians.map(lambda values: values.requires_grad_())
     background = torch.tensor([0.2, 0.5, 0.9])
     gsplat = StandIn()
-    monkeypatch.setattr(cuda, "_load_gsplat", lambda: gsplat)
-    ours = cuda.rasterize_cuda(gaussians, camera, background, 0.3, antialiased, EXTRAS)
+    monkeypatch.setattr(adapter, "_load_gsplat", lambda: gsplat)
+    ours = adapter.rasterize_gsplat(gaussians, camera, background, 0.3, antialiased, EXTRAS)
     true = rasterize_reference(gaussians, camera, background, 0.3, antialiased, EXTRAS)
     for name in ("color", "alpha", "depth", "median_depth", "first_hit_depth", "largest_weight_id"):
         assert torch.allclose(getattr(ours, name), getattr(true, name), atol=1e-5), name
@@ -106,43 +107,67 @@ def test_adapter_returns_what_the_reference_does(monkeypatch, scene, antialiased
 
 
 def test_extras_are_computed_only_on_request(monkeypatch, scene):
-    monkeypatch.setattr(cuda, "_load_gsplat", StandIn)
-    bare = cuda.rasterize_cuda(*scene, None, 0.3, False, ())
+    monkeypatch.setattr(adapter, "_load_gsplat", StandIn)
+    bare = adapter.rasterize_gsplat(*scene, None, 0.3, False, ())
     assert bare.median_depth is None
     assert bare.contributors is None
-    assert cuda.rasterize_cuda(*scene, None, 0.3, False, ("median_depth",)).contributors is None
+    assert adapter.rasterize_gsplat(*scene, None, 0.3, False, ("median_depth",)).contributors is None
 
 
 @pytest.fixture
 def forgetful():
     """Have gsplat looked for anew, before and after."""
-    cuda._load_gsplat.cache_clear()
+    adapter._load_gsplat.cache_clear()
     yield
-    cuda._load_gsplat.cache_clear()
+    adapter._load_gsplat.cache_clear()
 
 
 def test_what_is_missing_is_said(monkeypatch, scene, forgetful):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(ConfigError, match="needs an NVIDIA GPU"):
-        cuda.rasterize_cuda(*scene, None, 0.3, False, ())
+        adapter.rasterize_gsplat(*scene, None, 0.3, False, ())
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setitem(sys.modules, "gsplat", None)
-    with pytest.raises(MissingDependencyError, match=r"dsar-avatar\[gpu\]"):
-        cuda.rasterize_cuda(*scene, None, 0.3, False, ())
+    with pytest.raises(MissingDependencyError, match=r"dsar-avatar\[gsplat\]"):
+        adapter.rasterize_gsplat(*scene, None, 0.3, False, ())
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        AttributeError("'NoneType' object has no attribute 'CameraModelType'"),
+        ImportError("cannot import name 'csrc' from 'gsplat'"),
+        RuntimeError("Error building extension 'gsplat_cuda'\n[1/9] nvcc ..."),
+        OSError("CUDA_HOME environment variable is not set"),
+        None,
+    ],
+)
+def test_what_keeps_gsplat_from_drawing_comes_with_advice(monkeypatch, forgetful, error):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     fakes = {name: types.ModuleType(name) for name in ("gsplat", "gsplat.cuda", "gsplat.cuda._backend")}
+    fakes["gsplat.cuda._backend"]._C = None
     for name, module in fakes.items():
         monkeypatch.setitem(sys.modules, name, module)
-    fakes["gsplat.cuda._backend"]._C = None
-    with pytest.raises(ConfigError, match="no CUDA toolkit"):
-        cuda._load_gsplat()
+
+    def fail(name, *more):
+        if error and name == "gsplat":
+            raise error
+        return find(name, *more)
+
+    find = builtins.__import__
+    monkeypatch.setattr(builtins, "__import__", fail)
+    reason = str(error).splitlines()[0] if error else "it found no CUDA toolkit"
+    with pytest.raises(ConfigError) as caught:
+        adapter._load_gsplat()
+    assert reason in str(caught.value)
+    assert "dsar-avatar[gpu]" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_gsplat_with_its_kernels_is_taken(monkeypatch, forgetful):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    fakes = {name: types.ModuleType(name) for name in ("gsplat", "gsplat.cuda", "gsplat.cuda._backend")}
     fakes["gsplat.cuda._backend"]._C = object()
-    assert cuda._load_gsplat() is fakes["gsplat"]
-
-
-@pytest.mark.gpu
-def test_auto_takes_gsplat_on_a_gpu(monkeypatch, scene):
-    gaussians, camera = scene
-    taken, draw = [], cuda.rasterize_cuda
-    monkeypatch.setattr(cuda, "rasterize_cuda", lambda *given: taken.append(given) or draw(*given))
-    rasterize(gaussians.map(torch.Tensor.cuda), camera)
-    assert len(taken) == 1
+    for name, module in fakes.items():
+        monkeypatch.setitem(sys.modules, name, module)
+    assert adapter._load_gsplat() is fakes["gsplat"]
