@@ -1,6 +1,6 @@
 """The network of the paper's section 3.4: one step of the autoregression for a batch of rollouts."""
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 
 import torch

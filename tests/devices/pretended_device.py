@@ -4,9 +4,9 @@ It proves on a CPU that a program would run on a GPU. Tensors on it have the hos
 But as on CUDA they do not mix with tensors in main memory, do not become NumPy arrays, and make the host wait
 when it reads them (`host_waits`).
 
-It is made of torch's private interface for backends written in Python (`PrivateUse1`): pinned to the version
-of torch in constraints.txt. What it does not pretend: streams, several devices, the order of atomic additions,
-generators of its own, torch.compile.
+It is made of torch's private interface for backends written in Python (`PrivateUse1`), as it is in one version.
+What it does not pretend: streams, several devices, the order of atomic additions, generators of its own,
+torch.compile.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -222,12 +222,11 @@ _backend = _Backend()
 def _aten_operators() -> Iterator[tuple[str, torch._ops.OpOverload]]:
     for full in torch._C._dispatch_get_all_op_names():
         namespace, _, name = full.partition("::")
-        packet = (
-            getattr(aten := torch.ops.aten, name.partition(".")[0], None) if namespace == "aten" else None
-        )
-        overload = None if packet is None else getattr(packet, name.partition(".")[2] or "default", None)
-        if overload is not None:
-            yield name, overload
+        packet, _, kind = name.partition(".")
+        # torch.ops does not show every operation that the dispatcher has.
+        overloads = getattr(torch.ops.aten, packet, None) if namespace == "aten" else None
+        if hasattr(overloads, kind or "default"):
+            yield name, getattr(overloads, kind or "default")
 
 
 def _is_factory(operator: torch._ops.OpOverload) -> bool:
