@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
+from dsar.devices import send
+
 _SSIM_WINDOW, _SSIM_SIGMA = 11, 1.5
 
 
@@ -43,7 +45,7 @@ def _blur_matrix(size: int, dtype: torch.dtype, device: torch.device) -> Float[T
     distance = torch.arange(size)[:, None] - torch.arange(size)
     window = torch.exp(-(distance**2) / (2 * _SSIM_SIGMA**2)) * (distance.abs() <= _SSIM_WINDOW // 2)
     reach = torch.arange(_SSIM_WINDOW) - _SSIM_WINDOW // 2
-    return (window / torch.exp(-(reach**2) / (2 * _SSIM_SIGMA**2)).sum()).to(device, dtype)
+    return send((window / torch.exp(-(reach**2) / (2 * _SSIM_SIGMA**2)).sum()).to(dtype), device)
 
 
 def mask_box(alpha: Shaped[np.ndarray, "h w"], margin: int) -> tuple[int, int, int, int]:

@@ -4,9 +4,9 @@ It proves on a CPU that a program would run on a GPU. Tensors on it have the hos
 But as on CUDA they do not mix with tensors in main memory, do not become NumPy arrays, and make the host wait
 when it reads them (`host_waits`).
 
-It is made of torch's private interface for backends written in Python (`PrivateUse1`), as it is in one version.
-What it does not pretend: streams, several devices, the order of atomic additions, generators of its own,
-torch.compile.
+It is made of torch's private interface for backends written in Python (`PrivateUse1`), which may change with
+any version. What it does not pretend: streams, several devices, the order of atomic additions, generators of
+its own, torch.compile.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -19,7 +19,6 @@ from torch.optim import optimizer as torch_optimizer
 from torch.utils import _foreach_utils
 from torch.utils import backend_registration as registration
 from torch.utils._mode_utils import no_dispatch
-from torch.utils._pytree import tree_leaves, tree_map_only
 
 from tests.devices.host_waits import COPIES, INDEXING, note_operation, note_wait, why_host_waits
 
@@ -112,7 +111,8 @@ def _dispatch(func: torch._ops.OpOverload, args: Sequence[Any], kwargs: dict[str
     if func._can_decompose():
         # In inference mode composite operations arrive whole; what they are made of is what counts.
         return func.decompose(*args, **kwargs)
-    tensors = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, Tensor)]
+    tensors: list[Tensor] = []
+    _map_tensors(tensors.append, (args, kwargs))
     host = [tensor for tensor in tensors if not isinstance(tensor, PretendedTensor)]
     _refuse_mixtures(func, args, kwargs, tensors, host)
     if why := why_host_waits(func, tuple(args), kwargs, host):
@@ -121,7 +121,7 @@ def _dispatch(func: torch._ops.OpOverload, args: Sequence[Any], kwargs: dict[str
     goes_to = kwargs.get("device")
     stays = goes_to is None or torch.device(goes_to).type == NAME
     shells = {id(tensor.host): tensor for tensor in tensors if isinstance(tensor, PretendedTensor)}
-    args, kwargs = tree_map_only(PretendedTensor, lambda tensor: tensor.host, (tuple(args), dict(kwargs)))
+    args, kwargs = _map_tensors(lambda tensor: getattr(tensor, "host", tensor), (tuple(args), kwargs))
     if goes_to is not None:
         kwargs["device"] = "cpu" if stays else goes_to
     kwargs.pop("pin_memory", None)
@@ -131,9 +131,18 @@ def _dispatch(func: torch._ops.OpOverload, args: Sequence[Any], kwargs: dict[str
     # What an operation gives back of its arguments is these very objects; the rest is new on the device.
     known = {id(tensor): tensor for tensor in host} | shells
     wrap = PretendedTensor if stays else (lambda tensor: tensor)
-    return tree_map_only(
-        Tensor, lambda tensor: known[id(tensor)] if id(tensor) in known else wrap(tensor), made
-    )
+    return _map_tensors(lambda tensor: known[id(tensor)] if id(tensor) in known else wrap(tensor), made)
+
+
+def _map_tensors(function: Callable[[Tensor], Any], value: Any) -> Any:
+    """Return what an operation takes or gives with a function applied to its tensors."""
+    if isinstance(value, Tensor):
+        return function(value)
+    if isinstance(value, (list, tuple)):
+        return type(value)([_map_tensors(function, each) for each in value])
+    if isinstance(value, dict):
+        return {name: _map_tensors(function, each) for name, each in value.items()}
+    return value
 
 
 def _refuse_mixtures(
@@ -251,10 +260,8 @@ def _casting(operator: torch._ops.OpOverload, dtype: torch.dtype | None) -> Call
     def cast(*args: Any, **kwargs: Any) -> Any:
         wanted = dtype or torch.get_autocast_dtype(NAME)
         with torch._C._ExcludeDispatchKeyGuard(only):
-            args, kwargs = tree_map_only(
-                Tensor,
-                lambda tensor: tensor.to(wanted) if tensor.is_floating_point() else tensor,
-                (args, kwargs),
+            args, kwargs = _map_tensors(
+                lambda tensor: tensor.to(wanted) if tensor.is_floating_point() else tensor, (args, kwargs)
             )
             return operator(*args, **kwargs)
 
