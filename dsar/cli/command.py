@@ -26,7 +26,7 @@ class Common(ABC):
     """Flags of every command."""
 
     device: str = "auto"
-    """Where to compute: cpu, cuda or cuda:N; auto: a GPU where there is one. Pictures are drawn on the CPU."""
+    """Where to compute: cpu, cuda or cuda:N; auto: a GPU if there is one. Pictures are drawn on the CPU."""
     progress: ProgressStyle = "auto"
     """How to show progress."""
     json: Path | None = None
