@@ -7,7 +7,9 @@ from pathlib import Path
 
 from dsar.cli.command import RunCommand
 from dsar.cli.previews import write_worst
+from dsar.config import ScheduleConfig
 from dsar.console import ProgressBar
+from dsar.errors import ConfigError
 
 
 @dataclass(frozen=True)
@@ -20,8 +22,10 @@ class Eval(RunCommand):
     """The paradigms of other systems, likewise."""
     capture: str = "embedded"
     """What tables are made on: a capture folder, `embedded` or `embedded-wool`."""
-    minutes: float = 10.0
-    """Training of each of a table's models."""
+    tables: tuple[str, ...] = ()
+    """Only these of the tables, by name, as `ablation memories`."""
+    steps: int = ScheduleConfig.steps
+    """Updates of each of a table's models."""
     hours: float | None = None
     """Stop before this time is over; the same command goes on with what is missing."""
     study: Path = Path("runs/study")
@@ -62,17 +66,20 @@ class Eval(RunCommand):
         from dsar.atomic_files import write_text_atomically
         from dsar.config import absolute_capture
         from dsar.evaluation.study import ABLATIONS, BASELINES, Study, summarize_tables, to_markdown
-        from dsar.evaluation.study.chart import chart_points, draw_chart, training_time_series
+        from dsar.evaluation.study.chart import chart_points, draw_chart, training_length_series
 
         device = self.chosen_device()
         every = ABLATIONS | BASELINES
         tables = (ABLATIONS if self.ablations else {}) | (BASELINES if self.baselines else {})
+        if unknown := set(self.tables) - set(tables):
+            raise ConfigError(f"no table {', '.join(sorted(unknown))}; there are {', '.join(tables)}")
+        tables = {name: table for name, table in tables.items() if name in self.tables or not self.tables}
         capture = absolute_capture(self.capture)
-        study = Study(self.study, self.minutes, capture, device=device)
+        study = Study(self.study, self.steps, capture, device=device)
         with ProgressBar(self.progress, "study").running() as bar:
             complete = study.run(list(tables.values()), self.hours, lambda what, share: bar.show(share, what))
         summary = summarize_tables(study, tables)
-        facts = {"complete": complete, "minutes": self.minutes, "capture": capture}
+        facts = {"complete": complete, "steps": self.steps, "capture": capture}
         self.write_json(facts | {"tables": summary})
         content = facts | {"tables": summarize_tables(study, every)}
         write_text_atomically(self.study / "study.json", json.dumps(content, indent=1) + "\n")
@@ -81,7 +88,7 @@ class Eval(RunCommand):
             sys.stdout.write("\nNot complete: the same command goes on with what is missing.\n")
         points = chart_points(summary)
         if self.chart is not None and points:
-            draw_chart(points, training_time_series(summary), self.chart)
+            draw_chart(points, training_length_series(summary), self.chart)
 
     def run_heldout(self) -> None:
         """Measure one run."""

@@ -17,6 +17,9 @@ STEPS_PER_SECOND = 240
 """Steps of the solver; a frame takes a whole number of them, and at least one."""
 SETTLING_SECONDS = 1.5
 """Time for which the cloth hangs in a motion's first pose before the motion begins."""
+LEAST_VOLUME = 0.25
+"""Share of its volume to which skin weights that blend opposed turns may flatten space. Below, as beneath a
+leg that is raised high, a way from home is shortened in proportion; it would grow without bound."""
 _CHUNK = 256
 """Frames whose body is posed at once."""
 
@@ -170,4 +173,4 @@ def displace(points: Float32[ndarray, "e n 3"], stage: Stage) -> Float[Tensor, "
     ways = way[..., :1] * across
     ways = ways + way[..., 1:2] * torch.linalg.cross(third, first)
     ways = ways + way[..., 2:] * torch.linalg.cross(first, second)
-    return ways / (first * across).sum(-1, keepdim=True)
+    return ways / (first * across).sum(-1, keepdim=True).clamp_min(LEAST_VOLUME)

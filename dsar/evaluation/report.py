@@ -19,7 +19,7 @@ from plotly.offline import get_plotlyjs
 from dsar.atomic_files import write_text_atomically
 from dsar.config import PRESETS, TrainConfig, absolute_capture, config_to_json
 from dsar.config.migrations import RENAMED_STAGES
-from dsar.evaluation.study.chart import QUALITIES, chart_points, interactive_chart, training_time_series
+from dsar.evaluation.study.chart import QUALITIES, chart_points, interactive_chart, training_length_series
 from dsar.evaluation.study.summary import table_cells
 from dsar.training.checkpoint import Run, read_config, read_json, read_progress
 
@@ -147,11 +147,11 @@ def _draw_study(summary: Mapping[str, Any], figures: Mapping[str, Any] | None) -
         figure.update_xaxes(type="log")
         yield _draw(figure, "milliseconds a frame", quality, log=False)
     figure = go.Figure()
-    for label, line in training_time_series(summary).items():
-        minutes, psnr = zip(*line, strict=True)
-        figure.add_scatter(x=minutes, y=psnr, name=label)
+    for label, line in training_length_series(summary).items():
+        updates, psnr = zip(*line, strict=True)
+        figure.add_scatter(x=updates, y=psnr, name=label)
     if figure.data:
-        yield _draw(figure, "minutes of training", "psnr_box", log=False)
+        yield _draw(figure, "updates", "psnr_box", log=False)
 
 
 def _draw_curves(lines: list[dict[str, Any]]) -> Iterator[str]:

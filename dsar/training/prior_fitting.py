@@ -148,7 +148,7 @@ class _Fit:
 
     def _simulate(
         self, constants: ClothConstants
-    ) -> tuple[list[Float[Tensor, "f g 3"]], Float[Tensor, "n 3"]]:
+    ) -> tuple[list[Float[Tensor, "_ g 3"]], Float[Tensor, "n 3"]]:
         """Return each clip's offsets at the control points, and how the cloth hangs at rest."""
         simulation, fabric = self.simulation, self.simulation.fabric(constants)
         hanging = hang(simulation, fabric, self.rest, self.fps)
@@ -157,7 +157,7 @@ class _Fit:
             for clip in self.clips
         ], hanging
 
-    def _trust(self, offsets: Sequence[Float[Tensor, "f g 3"]]) -> Float[Tensor, " r"]:
+    def _trust(self, offsets: Sequence[Float[Tensor, "_ g 3"]]) -> Float[Tensor, " r"]:
         """Return by row the share of the simulated offsets that explains the maps best; 1 where none tell."""
         rows, columns = self.garment.rest.shape[:2]
         if not self.clips:

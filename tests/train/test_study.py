@@ -33,7 +33,7 @@ TINY = {
 
 
 def test_every_row_of_the_tables_is_a_model_that_can_be_trained(tmp_path):
-    study = Study(tmp_path, 10.0)
+    study = Study(tmp_path, 1500)
     tables = [*ABLATIONS.values(), *BASELINES.values()]
     measurements = study.measurements(tables)
     configs = {each.model.name: study.config(each.model) for each in measurements}
@@ -46,13 +46,13 @@ def test_every_row_of_the_tables_is_a_model_that_can_be_trained(tmp_path):
 
 
 def test_a_row_that_names_no_setting_is_refused(tmp_path):
-    study = Study(tmp_path, 10.0)
+    study = Study(tmp_path, 1500)
     with pytest.raises(ConfigError, match=r"model\.windows"):
         study.config(runner.Model({"model.windows": 3}, 0))
 
 
 def test_a_study_goes_on_with_what_is_missing_and_does_nothing_twice(tiny_capture, tmp_path):
-    study = Study(tmp_path, 0.05, str(tiny_capture), cases={"causal": run_causal})
+    study = Study(tmp_path, 12, str(tiny_capture), cases={"causal": run_causal})
     tables = list(TINY.values())
     # An hour's budget of none: nothing is begun.
     assert not study.run(tables, hours=0.0)
@@ -71,14 +71,14 @@ def test_a_study_goes_on_with_what_is_missing_and_does_nothing_twice(tiny_captur
     assert study.run(tables, hours=0.0, report=lambda *what: told.append(what))
     assert told == [("done", 1.0)]
     with pytest.raises(ConfigError, match=r"full,seed=0/measured\.json is of a model with other settings"):
-        Study(tmp_path, 0.1, str(tiny_capture)).run(tables)
+        Study(tmp_path, 13, str(tiny_capture)).run(tables)
     (tmp_path / "feedback=0,seed=0" / "measured.json").unlink()
     with pytest.raises(ConfigError, match="feedback=0,seed=0 is of a model with other settings"):
-        Study(tmp_path, 0.1, str(tiny_capture)).run([Table("less", (TINY["tiny"].rows[1],))])
+        Study(tmp_path, 13, str(tiny_capture)).run([Table("less", (TINY["tiny"].rows[1],))])
 
     summary = summarize_tables(study, TINY)
     run = Run(tmp_path / "full,seed=0")
-    found = {"complete": False, "minutes": 0.05, "capture": str(tiny_capture), "tables": summary}
+    found = {"complete": False, "steps": 12, "capture": str(tiny_capture), "tables": summary}
     write_text_atomically(run.study, json.dumps(found))
     page = write_report(run).read_text()
     for text in ("Beside other models", "not complete yet", "no feedback"):

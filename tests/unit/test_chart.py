@@ -10,7 +10,7 @@ from dsar.evaluation.study.chart import (
     draw_chart,
     interactive_chart,
     pareto_front,
-    training_time_series,
+    training_length_series,
 )
 
 POINTS = [
@@ -31,7 +31,14 @@ def test_the_front_holds_who_is_beaten_by_nobody():
 
 
 def test_zeroed_and_missing_rows_are_no_models():
-    mean = {"fps": 50.0, "psnr_box": 21.0, "lpips": None, "gaussians": 100.0, "passed": 1.0, "minutes": 5.0}
+    mean = {
+        "fps": 50.0,
+        "psnr_box": 21.0,
+        "lpips": None,
+        "gaussians": 100.0,
+        "passed": 1.0,
+        "updates": 1500.0,
+    }
     row = {"label": "full", "settings": {}, "zeroed": [], "mean": mean, "spread": dict.fromkeys(mean)}
     rows = [row, row | {"label": "again"}, row | {"zeroed": ["state"], "settings": {"a": 1}}]
     rows.append(row | {"settings": {"b": 1}, "mean": dict.fromkeys(mean)})
@@ -40,8 +47,8 @@ def test_zeroed_and_missing_rows_are_no_models():
         row
         | {"label": "for long"}
         | {
-            "settings": {"schedule.minutes": 20.0},
-            "mean": mean | {"psnr_box": 22.0, "minutes": 20.0},
+            "settings": {"schedule.steps": 6000},
+            "mean": mean | {"psnr_box": 22.0, "updates": 6000.0},
         }
     )
     summary = {
@@ -52,7 +59,7 @@ def test_zeroed_and_missing_rows_are_no_models():
     assert chart_points(summary) == [Point("full", 20.0, 21.0, None, 100.0, 1.0)]
     row["spread"]["psnr_box"] = 0.4
     assert chart_points(summary)[0].spread == {"psnr_box": 0.2}
-    assert training_time_series(summary) == {"full": [(5.0, 21.0), (20.0, 22.0)]}
+    assert training_length_series(summary) == {"full": [(1500.0, 21.0), (6000.0, 22.0)]}
 
 
 def test_the_interactive_chart_names_who_was_measured():

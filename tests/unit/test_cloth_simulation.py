@@ -15,6 +15,7 @@ from dsar.dynamics.cloth import ClothConstants
 from dsar.dynamics.collider import BodyCollider
 from dsar.dynamics.simulation import ClothSimulation
 from dsar.dynamics.tube import coarsen_tube, sample_tube
+from dsar.geometry.rotations import matrix_from_axis_angle
 from dsar.types import Motion
 from tests.loose_cloth import FPS, skirt_avatar, striding
 
@@ -42,6 +43,22 @@ def test_a_motion_in_chunks_is_the_motion_at_once_to_the_bit(skirt, monkeypatch)
     whole = skirt.displacements(skirt.stage(transforms), fabric, FPS)
     assert whole.abs().max() > 0.02
     assert torch.equal(skirt.follow(transforms, fabric, FPS), whole)
+
+
+def test_a_way_from_home_is_carried_back_exactly_and_fades_where_skinning_flattens_space():
+    turns = torch.stack(
+        [torch.eye(3), torch.diag(torch.tensor([1.0, 0.9, 0.4])), torch.diag(torch.tensor([1.0, 0.1, 0.1]))]
+    )
+    turns = (rotation := matrix_from_axis_angle(torch.tensor([0.3, -0.8, 0.5]))) @ turns
+    home = np.zeros((1, 3, 3), np.float32)
+    stage = simulations.Stage(home, home, home, turns[None])
+    way = torch.tensor([0.03, 0.2, -0.1])
+    found = simulations.displace((turns @ way).numpy()[None], stage)[0]
+    torch.testing.assert_close(found[:2], way.expand(2, 3), atol=1e-6, rtol=0)
+    torch.testing.assert_close(found[2], way * 0.01 / simulations.LEAST_VOLUME, atol=1e-6, rtol=0)
+    # However flat: never farther than this.
+    flat = simulations.displace((rotation @ way).numpy()[None, None].repeat(3, 1), stage)[0]
+    assert float(flat.norm(dim=-1).max()) < float(way.norm()) / simulations.LEAST_VOLUME
 
 
 @pytest.mark.parametrize("frames", [1, 2])

@@ -19,7 +19,7 @@ PAPER = {
 Quality = Literal["psnr_box", "lpips"]
 QUALITIES: tuple[Quality, ...] = ("psnr_box", "lpips")
 _LABELS: Mapping[Quality, str] = {"psnr_box": "PSNR, dB (ours: in the mask's box)", "lpips": "LPIPS"}
-_TIME, _SPLIT = "schedule.minutes", "fd"
+_LENGTH, _SPLIT = "schedule.steps", "fd"
 _OFFSETS = tuple((x, y) for x in (7.0, -7.0, 20.0, -20.0, 36.0, -36.0) for y in (2.0, -8.0, 12.0, -18.0))
 """Where a name may stand beside its model, points."""
 _LEADER = {"arrowstyle": "-", "linewidth": 0.4, "color": "grey", "shrinkA": 0, "shrinkB": 0}
@@ -52,7 +52,7 @@ def chart_points(summary: Mapping[str, TableSummary]) -> list[Point]:
     """Return the models of a study's summary that were measured whole and trained as long, each once."""
     points: dict[str, Point] = {}
     for row in _measured_rows(summary):
-        if _TIME not in row["settings"]:
+        if _LENGTH not in row["settings"]:
             point = Point(
                 row["label"],
                 ms=1000 / _mean(row, "fps"),
@@ -66,15 +66,15 @@ def chart_points(summary: Mapping[str, TableSummary]) -> list[Point]:
     return list(points.values())
 
 
-def training_time_series(summary: Mapping[str, TableSummary]) -> dict[str, list[tuple[float, float]]]:
-    """Return minutes of training and PSNR in the box of each model that was trained for several times."""
+def training_length_series(summary: Mapping[str, TableSummary]) -> dict[str, list[tuple[float, float]]]:
+    """Return updates and PSNR in the box of each model that was trained for several lengths."""
     series: dict[str, dict[float, float]] = {}
     labels: dict[str, str] = {}
     for row in _measured_rows(summary):
-        model = _key({key: value for key, value in row["settings"].items() if key != _TIME})
-        series.setdefault(model, {})[_mean(row, "minutes")] = _mean(row, "psnr_box")
+        model = _key({key: value for key, value in row["settings"].items() if key != _LENGTH})
+        series.setdefault(model, {})[_mean(row, "updates")] = _mean(row, "psnr_box")
         labels.setdefault(model, row["label"])
-    return {labels[key]: sorted(times.items()) for key, times in series.items() if len(times) > 1}
+    return {labels[key]: sorted(lengths.items()) for key, lengths in series.items() if len(lengths) > 1}
 
 
 def _measured_rows(summary: Mapping[str, TableSummary]) -> list[RowSummary]:
@@ -105,7 +105,7 @@ def pareto_front(points: Sequence[Point], quality: Quality) -> list[Point]:
 
 
 def draw_chart(
-    points: Sequence[Point], times: Mapping[str, Sequence[tuple[float, float]]], path: Path
+    points: Sequence[Point], lengths: Mapping[str, Sequence[tuple[float, float]]], path: Path
 ) -> Path:
     """Draw time against PSNR and against LPIPS, and the paper's published figures on panels of their own.
 
@@ -115,7 +115,7 @@ def draw_chart(
 
     Args:
         points: The models.
-        times: Minutes of training and PSNR by model, from `training_time_series`.
+        lengths: Updates and PSNR by model, from `training_length_series`.
         path: .svg, .png or any other format that matplotlib writes.
 
     Raises:
@@ -128,7 +128,7 @@ def draw_chart(
     figure = Figure(figsize=(20, 11), layout="constrained")
     panels = figure.subplots(2, 3, height_ratios=[2, 1])
     panels[1][2].remove()
-    _draw_times(panels[0][2], times)
+    _draw_lengths(panels[0][2], lengths)
     for column, quality in enumerate(_LABELS):
         drawn = _draw_models(panels[0][column], points, quality)
         _draw_published(panels[1][column], column + 1, quality)
@@ -192,11 +192,11 @@ def _name_models(axes: Any, points: Sequence[Point], quality: Quality) -> None:
             name.remove()
 
 
-def _draw_times(axes: Any, times: Mapping[str, Sequence[tuple[float, float]]]) -> None:
-    for label, line in times.items():
+def _draw_lengths(axes: Any, lengths: Mapping[str, Sequence[tuple[float, float]]]) -> None:
+    for label, line in lengths.items():
         axes.plot(*zip(*line, strict=True), "o-", label=label)
-    axes.set(xlabel="minutes of training, on this machine", ylabel=_LABELS["psnr_box"])
-    if times:
+    axes.set(xlabel="updates", ylabel=_LABELS["psnr_box"])
+    if lengths:
         axes.legend()
 
 

@@ -25,10 +25,10 @@ from dsar.training.loop import train
 from dsar.training.report import Report
 from dsar.training.scene import open_images, open_scene
 
-_MEASURING = 2
-"""Minutes that measuring a model takes on two cores, about."""
-_ENOUGH = 1_000_000
-"""Updates that no budget of minutes reaches."""
+_MEASURING = 120.0
+"""Seconds that measuring a model takes on two cores, about."""
+_UPDATE = 0.25
+"""Seconds of an update, likewise, as long as none was trained here."""
 Reporter = Callable[[str, float], None]
 """Is told what is being done, and the share of the study that is done."""
 
@@ -57,12 +57,12 @@ class Measurement:
 
 @dataclass(frozen=True)
 class Study:
-    """A folder of models that were trained for equally long on one capture."""
+    """A folder of models that were trained by equally many updates on one capture."""
 
     folder: Path
     """Holds a run folder a model, with its figures."""
-    minutes: float
-    """Budget of each model's training."""
+    steps: int
+    """Updates of each model's training."""
     capture: str = "embedded"
     """A capture folder, `embedded` or `embedded-wool`."""
     preset: str = "demo"
@@ -88,7 +88,7 @@ class Study:
             ConfigError: a row names a setting that does not exist, or settings contradict each other.
         """
         config = PRESETS[self.preset]
-        schedule = dataclasses.replace(config.schedule, steps=_ENOUGH, minutes=self.minutes)
+        schedule = dataclasses.replace(config.schedule, steps=self.steps)
         config = dataclasses.replace(
             config, capture=absolute_capture(self.capture), seed=model.seed, schedule=schedule
         )
@@ -109,17 +109,19 @@ class Study:
 
         With `hours` nothing is begun that would likely take longer. An interrupted model goes on.
         """
-        began, needed = time.monotonic(), self.measurements(tables)
+        began, needed, update = time.monotonic(), self.measurements(tables), _UPDATE
         for done, each in enumerate(needed):
             if self._measured(each):
                 continue
             if not self._trained(each.model):
-                ends = time.monotonic() - began + 60 * self._expected(each.model)
-                if hours is not None and ends > 3600 * hours:
+                config, run = self.config(each.model), self._run(each.model)
+                left = config.schedule.steps * (1 - (read_progress(run).progress if run.exists else 0.0))
+                now = time.monotonic()
+                if hours is not None and now - began + update * left + _MEASURING > 3600 * hours:
                     return False
-                run, what = self._run(each.model), f"train {each.model.name}"
-                follow = partial(_follow, report, what, done, len(needed))
-                train(self.config(each.model), run, resume=run.exists, report=follow, device=self.device)
+                follow = partial(_follow, report, f"train {each.model.name}", done, len(needed))
+                train(config, run, resume=run.exists, report=follow, device=self.device)
+                update = (time.monotonic() - now) / max(left, 1)
             report(f"measure {each.model.name}", (done + 1) / len(needed))
             self._measure(each)
         report("done", 1.0)
@@ -133,12 +135,8 @@ class Study:
 
     def _model(self, row: Row, seed: int) -> Model:
         # A row of the study's own length is the same model as one that names no length.
-        same = ("schedule.minutes", self.minutes)
+        same = ("schedule.steps", self.steps)
         return Model({key: value for key, value in row.settings.items() if (key, value) != same}, seed)
-
-    def _expected(self, model: Model) -> float:
-        """Return the minutes that a model takes."""
-        return (self.config(model).schedule.minutes or self.minutes) + _MEASURING
 
     def _run(self, model: Model) -> Run:
         return Run(self.folder / model.name)
@@ -167,7 +165,7 @@ class Study:
             }  # older ones were relative
         if settings != json.loads(config_to_json(self.config(model))):
             raise ConfigError(
-                f"{path} is of a model with other settings than this study's ({self.minutes:g} minutes, "
+                f"{path} is of a model with other settings than this study's ({self.steps} updates, "
                 f"preset {self.preset}, this version's defaults); give the study another folder"
             )
 

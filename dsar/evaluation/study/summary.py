@@ -8,7 +8,7 @@ from dsar.evaluation.study.runner import Study
 from dsar.evaluation.study.tables import Row, Table
 
 _IMAGE = ("psnr", "psnr_box", "psnr_garment", "ssim", "lpips", "lpips_vgg", "flip", "tpsnr", "vmaf")
-_COLUMNS = (*_IMAGE, "correlation", "unseen", "fps", "gaussians", "passed", "updates", "minutes")
+_COLUMNS = (*_IMAGE, "correlation", "unseen", "fps", "gaussians", "passed", "updates")
 _DIGITS = {
     "ssim": 4,
     "lpips": 4,
@@ -18,7 +18,6 @@ _DIGITS = {
     "fps": 0,
     "gaussians": 0,
     "updates": 0,
-    "minutes": 1,
 }
 
 
@@ -88,7 +87,6 @@ def _columns_of(figures: Mapping[str, Any], split: str) -> dict[str, float | Non
         "gaussians": figures["gaussians"],
         "passed": None if battery is None else sum(c["pass"] for c in battery.values()) / len(battery),
         "updates": figures["updates"],
-        "minutes": figures["config"]["schedule"]["minutes"],
     }
 
 

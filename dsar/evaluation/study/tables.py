@@ -202,10 +202,10 @@ ABLATIONS: dict[str, Table] = {
 }
 
 ABLATIONS["time"] = Table(
-    "Training time",
+    "Length of training",
     tuple(
-        Row(label, {**settings, "schedule.minutes": minutes})
-        for minutes in (2.5, 10.0, 20.0)
+        Row(label, {**settings, "schedule.steps": steps})
+        for steps in (750, 3000, 6000)
         for label, settings in (("full model", {}), ("pose only", _POSE_ONLY))
     ),
 )
