@@ -152,7 +152,8 @@ def measure_flops(device: torch.device | None = None) -> float:
     torch.set_num_threads(1)
     try:
         with torch.no_grad():
-            layer(x)[0, 0, 0, 0].item()
+            y = layer(x)
+            y[0, 0, 0, 0].item()
             start = time.perf_counter()
             for _ in range(_REPEATS):
                 y = layer(x)
