@@ -8,11 +8,14 @@ import pytest
 import torch
 
 from dsar.avatar.rollout import roll_out
+from dsar.cli import main
 from dsar.cli.drive_command import DrivenAvatar
 from dsar.data.captures.formats import open_capture
-from dsar.evaluation import heldout
+from dsar.evaluation import heldout, profiling
 from dsar.evaluation import stress as battery
+from dsar.evaluation.looping import loop_motion
 from dsar.evaluation.profiling import time_rollout
+from dsar.evaluation.stress_motions import spin_and_stop, sway_motion
 from dsar.metrics.lpips import Lpips
 from dsar.training.checkpoint import load_checkpoint
 from tests.devices.host_waits import watch
@@ -32,10 +35,16 @@ CASES = battery.CASES | {
 
 
 @pytest.fixture(scope="module")
-def avatars(device, tmp_path_factory):
+def run(tmp_path_factory):
+    """A run that the host trained."""
+    with plain_torch():
+        return train_small(tmp_path_factory.mktemp("runs") / "run", "cpu", stop_after=3)
+
+
+@pytest.fixture(scope="module")
+def avatars(device, run):
     """Yield one trained avatar on the host, and the same on the device."""
     with plain_torch():
-        run = train_small(tmp_path_factory.mktemp("runs") / "run", "cpu", stop_after=3)
         host = load_checkpoint(run)[0]
         torch.manual_seed(0)
         torch.nn.init.normal_(host.network.decoder.head.weight, std=0.05)
@@ -102,8 +111,21 @@ def test_deliveries_are_in_main_memory_wherever_the_avatar_is(avatars):
     assert not isinstance(binding.T_world_rest, PretendedTensor)
 
 
+def test_a_command_on_the_device_writes_the_hosts_files(device, run, tmp_path, monkeypatch):
+    files = []
+    for place in (torch.device("cpu"), device):
+        monkeypatch.setattr("dsar.devices.choose_device", lambda _, place=place: place)
+        folder = tmp_path / place.type
+        with plain_torch(), cuda_graphs():
+            main(["export", str(run.folder), "--motion", TEST, "--ply", str(folder), "--progress", "none"])
+        files.append({path.name: path.read_bytes() for path in folder.glob("*.ply")})
+    assert len(files[0]) == 4
+    assert files[0] == files[1]
+
+
 def test_figures_of_an_avatar_on_the_device_are_the_hosts(avatars, capture, monkeypatch):
     monkeypatch.setattr(heldout, "time_rollout", partial(time_rollout, frames=2))
+    monkeypatch.setattr(profiling, "_WARM_UP", 1)
     # As if LPIPS's weights were on this machine.
     torch.manual_seed(0)
     weights = Lpips("alex").state_dict()
@@ -131,7 +153,11 @@ def lpips_with(weights) -> Lpips:
     return model
 
 
-def test_the_battery_finds_the_same_on_the_device(avatars, capture):
+def test_the_battery_finds_the_same_on_the_device(avatars, capture, monkeypatch):
+    # Motions of some tenths of a second do for equality.
+    monkeypatch.setattr(battery, "loop_motion", partial(loop_motion, bridge=0.2))
+    monkeypatch.setattr(battery, "sway_motion", partial(sway_motion, seconds=0.2))
+    monkeypatch.setattr(battery, "spin_and_stop", partial(spin_and_stop, spin=0.5, rest=3.2))
     verdicts = []
     for avatar in avatars:
         with cuda_graphs():
