@@ -17,7 +17,7 @@ from dsar.dynamics.cloth import ClothConstants, build_constraints
 from dsar.dynamics.collider import BodyCollider
 from dsar.dynamics.simulation import ClothSimulation, ClothState, Fabric, Stage
 from dsar.dynamics.solver import simulate
-from dsar.dynamics.tube import coarsen_tube, sample_tube
+from dsar.dynamics.tube import average_tube, sample_tube
 from dsar.training.prior_fitting import FARTHEST, SPREAD, USUAL, constants_at
 from priors.clock import processor_ms
 from priors.subject import Offsets, Subject
@@ -97,17 +97,20 @@ class SimulatedGarment:
     def __init__(self, subject: Subject, grid: tuple[int, int]) -> None:
         """Prepare all motions."""
         self.subject = subject
-        rest = coarsen_tube(subject.rest.unflatten(0, subject.shape), *grid)
-        weights = coarsen_tube(subject.weights.unflatten(0, subject.shape), *grid)
+        height, width = subject.shape
+        places = torch.linspace(0, grid[0] - 1, height)
+        rest = average_tube(subject.rest.unflatten(0, subject.shape), places, grid)
+        weights = average_tube(subject.weights.unflatten(0, subject.shape), places, grid)
         heights = rest[..., 1]
         collider = BodyCollider(subject.body, float(heights.max()), float(heights.min()))
         self.simulation = ClothSimulation(collider, rest, weights / weights.sum(-1, keepdim=True))
         self.stages = {name: self.simulation.stage(subject.transforms[name]) for name in subject.names}
-        rows, columns = (axis.flatten().float() for axis in torch.meshgrid(
-            *(torch.arange(size) for size in subject.shape), indexing="ij"))  # fmt: skip
-        self.sampling = sample_tube(rows, columns, subject.shape, grid)
-        few = slice(subject.shape[1], None, _EVERY)
-        self.few = sample_tube(rows[few], columns[few], subject.shape, grid)
+        down, columns = (
+            axis.flatten() for axis in torch.meshgrid(places, torch.arange(width).float(), indexing="ij")
+        )
+        self.sampling = sample_tube(down, columns, width, grid)
+        few = slice(width, None, _EVERY)
+        self.few = sample_tube(down[few], columns[few], width, grid)
 
     def displacements(
         self, constants: ClothConstants, names: tuple[str, ...], make: Make = USUAL_MAKE

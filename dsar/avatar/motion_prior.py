@@ -19,7 +19,7 @@ from dsar.avatar.input_maps import REFERENCE_FPS
 from dsar.dynamics.cloth import ClothConstants
 from dsar.dynamics.collider import BodyCollider
 from dsar.dynamics.simulation import ClothSimulation, Fabric, Stage
-from dsar.dynamics.tube import TubeSampling, coarsen_tube, sample_tube
+from dsar.dynamics.tube import TubeSampling, average_tube, fit_tube, places_down, sample_tube
 from dsar.types import Body
 
 GRID = (9, 24)
@@ -59,9 +59,10 @@ class GarmentPrior(nn.Module):
         on_chart = control.on_charts([chart.downsampled(upsample)])
         rows, columns = control.cells[on_chart] // control.size[1], control.cells[on_chart] % control.size[1]
         centres = [(place + 0.5) * upsample - 0.5 for place in (rows.float(), columns.float())]
-        sampling = sample_tube(centres[0] - chart.rows.start, centres[1], self.size, GRID)
-        self.register_buffer("indices", sampling.indices, persistent=False)
-        self.register_buffer("sampling_weights", sampling.weights, persistent=False)
+        self._control = centres[0] - chart.rows.start, centres[1]
+        sampling = self._sampling_at(torch.linspace(0, GRID[0] - 1, self.size[0]))
+        self.register_buffer("indices", sampling.indices)
+        self.register_buffer("sampling_weights", sampling.weights)
         self.register_buffer("axes", control.axes[on_chart], persistent=False)
         self.register_buffer("rest", torch.zeros(*GRID, 3))
         self.register_buffer("weights", torch.zeros(*GRID, control.weights.shape[1]))
@@ -82,9 +83,22 @@ class GarmentPrior(nn.Module):
 
     def place(self, positions: Float[Tensor, "n 3"], weights: Float[Tensor, "n j"]) -> None:
         """Set the rest shape and the skin weights from all texels of the chart, row by row."""
-        self.rest.copy_(coarsen_tube(positions.unflatten(0, self.size), *GRID))
-        blended = coarsen_tube(weights.unflatten(0, self.size), *GRID)
+        points = positions.unflatten(0, self.size)
+        places = places_down(points, GRID[0])
+        self.rest.copy_(fit_tube(points, places, GRID))
+        blended = average_tube(weights.unflatten(0, self.size), places, GRID)
         self.weights.copy_(blended / blended.sum(-1, keepdim=True))
+        sampling = self._sampling_at(places)
+        self.get_buffer("indices").copy_(sampling.indices)
+        self.get_buffer("sampling_weights").copy_(sampling.weights)
+
+    def _sampling_at(self, places: Float[Tensor, " h"]) -> TubeSampling:
+        """Return how control points are sampled where texel rows lie at some places among the grid's."""
+        rows, columns = self._control
+        above = rows.floor().long().clamp(0, max(len(places) - 2, 0))
+        below = (above + 1).clamp_max(len(places) - 1)
+        down = torch.lerp(places[above], places[below], (rows - above).clamp(0, 1))
+        return sample_tube(down, columns, self.size[1], GRID)
 
     def simulation(self, body: Body) -> ClothSimulation:
         """Return the simulation of the garment on a body."""

@@ -1,4 +1,4 @@
-"""A garment's simulation on the body: in parts, across cuts and rates; its grid and its collider."""
+"""A garment's simulation on the body: in parts, across cuts and rates; its collider."""
 
 import dataclasses
 
@@ -14,7 +14,6 @@ from dsar.dynamics import simulation as simulations
 from dsar.dynamics.cloth import ClothConstants
 from dsar.dynamics.collider import BodyCollider
 from dsar.dynamics.simulation import ClothSimulation
-from dsar.dynamics.tube import coarsen_tube, sample_tube
 from dsar.geometry.rotations import matrix_from_axis_angle
 from dsar.types import Motion
 from tests.loose_cloth import FPS, skirt_avatar, striding
@@ -162,69 +161,6 @@ def test_the_cloth_on_a_motion_without_end_stays_finite_and_near(skirt):
 
 
 # The grid.
-
-
-def chart_places(height, width):
-    rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-    return rows.float(), columns.float()
-
-
-@pytest.mark.parametrize("size", [(17, 48), (64, 192), (9, 24), (8, 32)])
-def test_means_on_a_coarse_grid_keep_what_is_linear_down_and_constant_around(size):
-    rows, _ = chart_places(*size)
-    values = torch.stack([torch.ones(size), rows / (size[0] - 1)], -1)
-    coarse = coarsen_tube(values, *GRID)
-    torch.testing.assert_close(coarse[..., 0], torch.ones(GRID))
-    down = torch.linspace(0, 1, GRID[0])[:, None].expand(GRID)
-    # Means around the first and the last row have values on one side only.
-    torch.testing.assert_close(coarse[1:-1, :, 1], down[1:-1], atol=0.02, rtol=0)
-    assert (coarse[..., 1] - down).abs().max() < 0.5 / (GRID[0] - 1)
-
-
-def test_sampling_is_exact_for_what_is_linear_down_and_between_columns():
-    size, grid = (33, 96), (9, 24)
-    rows, columns = chart_places(*size)
-    inside = (columns > 4) & (columns < 91)
-    sampling = sample_tube(rows[inside], columns[inside], size, grid)
-    down = torch.linspace(0, 1, grid[0])[:, None].expand(grid)
-    # A grid's column is in the middle of four texels'.
-    along = ((torch.arange(grid[1]) + 0.5) / grid[1]).expand(grid)
-    found = sampling(torch.stack([down, along], -1).flatten(0, 1))
-    torch.testing.assert_close(found[:, 0], rows[inside] / 32)
-    torch.testing.assert_close(found[:, 1], (columns[inside] + 0.5) / 96)
-    torch.testing.assert_close(sampling.weights.sum(-1), torch.ones(int(inside.sum())))
-
-
-def test_sampling_closes_around_the_seam():
-    size, grid = (33, 96), (9, 24)
-    rows, columns = chart_places(*size)
-    around = (torch.arange(grid[1]) + 0.5) / grid[1] * 2 * torch.pi
-    values = torch.stack([around.sin(), around.cos()], -1).expand(*grid, 2).flatten(0, 1)
-    found = sample_tube(rows.flatten(), columns.flatten(), size, grid)(values)
-    angle = (columns.flatten() + 0.5) / 96 * 2 * torch.pi
-    # A chord is 1 - cos(half a column) inside its arc.
-    assert (found - torch.stack([angle.sin(), angle.cos()], -1)).norm(dim=-1).max() < 0.009
-
-
-def test_a_turned_chart_has_the_turned_means_and_samples():
-    values = torch.rand(33, 96, 3, generator=torch.Generator().manual_seed(0))
-    coarse = coarsen_tube(values, 9, 24)
-    torch.testing.assert_close(coarsen_tube(values.roll(4 * 5, 1), 9, 24), coarse.roll(5, 1))
-    rows, columns = (x.flatten() for x in chart_places(33, 96))
-    one = sample_tube(rows, columns, (33, 96), (9, 24))(coarse.flatten(0, 1))
-    two = sample_tube(rows, (columns + 20) % 96, (33, 96), (9, 24))(coarse.roll(5, 1).flatten(0, 1))
-    torch.testing.assert_close(one, two)
-
-
-def test_smooth_values_survive_the_way_to_the_grid_and_back():
-    rows, columns = chart_places(64, 192)
-    angle = (columns + 0.5) / 192 * 2 * torch.pi
-    values = torch.stack([angle.cos() * rows / 63, (2 * angle).sin(), rows / 63], -1)
-    coarse = coarsen_tube(values, *GRID)
-    back = sample_tube(rows.flatten(), columns.flatten(), (64, 192), GRID)(coarse.flatten(0, 1))
-    errors = (back - values.flatten(0, 1)).norm(dim=-1).unflatten(0, (64, 192))
-    # A hat function of two columns takes 4 % off the second harmonic, and sampling 1.7 % more.
-    assert errors[8:-8].max() < 0.06
 
 
 # The collider.
