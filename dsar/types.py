@@ -290,6 +290,12 @@ class GaussianSequence:
         """Return the number of frames."""
         return len(self.frame_numbers)
 
+    def in_main_memory(self) -> "GaussianSequence":
+        """Return the same frames in main memory, where files and images are made of them."""
+        return dataclasses.replace(
+            self, produce=lambda: (gaussians.map(Tensor.cpu) for gaussians in self.produce())
+        )
+
     def __iter__(self) -> Iterator[tuple[int, Gaussians]]:
         """Yield (frame number, Gaussians); every call is a new pass from the first frame."""
         return zip(self.frame_numbers, self.produce(), strict=True)

@@ -25,6 +25,7 @@ from dsar.avatar.texel_skin import TexelSkin
 from dsar.body.model import PARENTS
 from dsar.body.skinning import blend_transforms
 from dsar.config import AtlasConfig, ModelConfig
+from dsar.devices import takes_kernels
 from dsar.geometry.harmonics import dc_from_color
 from dsar.network import STREAMS, NetworkOutput, NetworkState, Stream, build_network
 from dsar.types import Body, Capture, Gaussians, Motion
@@ -54,6 +55,8 @@ class Avatar(nn.Module):
     texel_borrowed: Tensor
     """Those of them that were never seen without one, and have the looks of others."""
     texel_axes: Tensor
+    garment_indices: Tensor
+    garment_point_indices: Tensor
     body_joints: Tensor
 
     def __init__(self, body: Body, atlas: Atlas, model: ModelConfig, fps: float) -> None:
@@ -76,6 +79,10 @@ class Avatar(nn.Module):
         self.register_buffer("texel_axes", axes.contiguous(), persistent=False)
         self.texel_skin = TexelSkin.of_weights(atlas.weights)
         self.control = ControlGrid(atlas, model.upsample, surface_axes=model.axes == "surface")
+        # Kept, for finding them makes the host wait for a GPU.
+        self.register_buffer("garment_indices", self.texels_on(self.garments), persistent=False)
+        garment_points = self.control.on_charts(self.control.charts[1:])
+        self.register_buffer("garment_point_indices", garment_points, persistent=False)
         self.prior: MotionPrior | None = None
         if model.prior == "cloth":
             self.prior = MotionPrior(atlas.charts[1:], self.control, model.upsample, atlas.width)
@@ -94,6 +101,11 @@ class Avatar(nn.Module):
         avatar = cls(body, _fit_atlas(capture, body, atlas, signals), model, next(iter(signals.values())).fps)
         avatar.fit_input_statistics([avatar.with_cloth(signal) for signal in signals.values()])
         return avatar
+
+    @property
+    def device(self) -> torch.device:
+        """Where the avatar is, and what it makes."""
+        return self.texel_positions.device
 
     @property
     def body(self) -> Body:
@@ -130,11 +142,11 @@ class Avatar(nn.Module):
 
     def garment_texels(self) -> Int64[Tensor, " g"]:
         """Return which Gaussians lie on garments' charts; none where there are none."""
-        return self.texels_on(self.garments)
+        return self.garment_indices
 
     def garment_control_points(self) -> Int64[Tensor, " g"]:
         """Return which control points lie on garments' charts; none where there are none."""
-        return self.control.on_charts(self.control.charts[1:])
+        return self.garment_point_indices
 
     def driving_signal(self, motion: Motion) -> DrivingSignal:
         """Return what drives the avatar through a motion."""
@@ -299,7 +311,7 @@ class Avatar(nn.Module):
         else:
             offset, appearance = output.offset, output.appearance
         sampling = self.control.sampling
-        if transforms.dtype == torch.float32 and transforms.device.type == "cpu":
+        if transforms.dtype == torch.float32 and takes_kernels(transforms):
             bones = self.texel_skin.blend(transforms)
             axes, fixed = self.texel_axes, self.texel_beneath
             return pose_fused(self.template, offset, appearance, sampling, axes, *bones, fixed)

@@ -63,7 +63,7 @@ class ControlGrid(nn.Module):
     @property
     def occupied(self) -> Bool[Tensor, "h w"]:
         """The grid's cells that have a control point."""
-        occupied = torch.zeros(self.size[0] * self.size[1], dtype=torch.bool)
+        occupied = self.cells.new_zeros(self.size[0] * self.size[1], dtype=torch.bool)
         occupied[self.cells] = True
         return occupied.reshape(self.size)
 
@@ -109,10 +109,10 @@ def find_surface_edges(
         charts: The grid's charts.
     """
     height, width = size
-    index = torch.full((height * width,), -1)
-    index[cells] = torch.arange(len(cells))
+    index = cells.new_full((height * width,), -1)
+    index[cells] = torch.arange(len(cells), device=cells.device)
     grid = index.reshape(size)
-    apart = torch.zeros(2, *size, dtype=torch.bool)
+    apart = cells.new_zeros(2, *size, dtype=torch.bool)
     for chart in charts:
         apart[0, chart.rows.start : chart.rows.stop, -1] = chart.topology == "island"
         apart[1, chart.rows.stop - 1] = True

@@ -101,7 +101,11 @@ class DrivingSignal:
 
     def cloth_at(self, frames: Sequence[int]) -> Float[Tensor, "b g 6"] | None:
         """Return the motion prior in some frames."""
-        return None if self.cloth is None else self.cloth[list(frames)]
+        if self.cloth is None:
+            return None
+        if isinstance(frames, range):
+            return self.cloth[frames.start : frames.stop : frames.step]
+        return self.cloth[list(frames)]
 
 
 def find_jumps(transforms: Float[Tensor, "f j 4 4"], pelvis: Float[Tensor, "3"], fps: float) -> list[int]:

@@ -67,7 +67,8 @@ def make_input_maps(
         axes = blend_transforms(control.weights, motion_windows[:, :1])[:, 0, :, :, :3] @ control.frames
     else:
         axes = headings[:, None].expand(-1, len(control.cells), -1, -1)
-    ground = root * root.new_tensor([1.0, 0.0, 1.0])
+    ground = root.clone()
+    ground[:, 1] = 0.0
     rate = fps / REFERENCE_FPS
     position = (points[:, 0] - ground[:, None]) @ headings
     velocities, fast = limit_norm((points[:, :2] - points[:, 1:3]) * rate, LIMITS.speed)

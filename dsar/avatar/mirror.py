@@ -31,7 +31,7 @@ class Mirror:
         """Pair each control point with the one of its chart nearest to its mirror image."""
         points, axes, cells = control.points, control.axes, control.cells
         flip = _FLIP.to(points)
-        counterpart = torch.empty(len(points), dtype=torch.int64)
+        counterpart = torch.empty_like(cells)
         for chart in control.charts:
             own = control.on_charts([chart])
             nearest = [

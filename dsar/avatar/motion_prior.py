@@ -165,6 +165,7 @@ class MotionPrior(nn.Module):
     ) -> Float[Tensor, "f g 6"]:
         if not garment.placed:
             return transforms.new_zeros(len(transforms), len(garment.axes), CHANNELS)
+        # Simulated in main memory, whatever the avatar's device: the solver is compiled for it.
         simulation = garment.simulation(body)
         fabric = simulation.fabric(garment.fabric_constants)
         hanging = garment.hanging.cpu()

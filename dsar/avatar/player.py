@@ -69,9 +69,8 @@ class Player:
         Without one of the `streams` the network runs as if it had none of its memory.
         """
         self.avatar, self.signal = avatar, signal
-        precision = torch.bfloat16 if signal.windows.is_cuda else None
-        self._session = InferenceSession(avatar.network, streams, precision)
-        jumped = torch.zeros(len(signal), dtype=torch.int64)
+        self._session = InferenceSession(avatar.network, streams)
+        jumped = signal.windows.new_zeros(len(signal), dtype=torch.int64)
         jumped[list(signal.jumps)] = 1
         self._jumped, self._next, self._distance = jumped, 0, SNAPSHOT_FRAMES
         self._snapshots: dict[int, SessionSnapshot] = {0: self._session.snapshot()}
@@ -117,8 +116,8 @@ class Player:
             raise IndexError(f"{self.signal.name} ends after {number} frames")
         if number % self._distance == 0 and number not in self._snapshots:
             self._keep_snapshot(number)
-        motion_window = self.signal.windows[[number]]
-        cloth = self.signal.cloth_at([number])
+        motion_window = self.signal.windows[number : number + 1]
+        cloth = self.signal.cloth_at(range(number, number + 1))
         inputs = avatar.input_maps(motion_window, avatar.fps, cloth)
         output = avatar.add_prior(self._session.step(*avatar.standardize(inputs)), cloth)
         near = LIMITS.offset * avatar.model.offset_limit

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from dsar.devices import takes_kernels
 from dsar.geometry.harmonics import rotate_harmonics
 from dsar.geometry.rotations import quaternion_from_matrix, quaternion_multiply
 from dsar.raster.jit import inlined, kernel
@@ -45,14 +46,14 @@ def pose_gaussians(
 def nearest_quaternions(matrices: Float[Tensor, "b n 3 3"]) -> Float[Tensor, "b n 4"]:
     """Return the unit quaternion wxyz of each matrix's nearest rotation; no gradient flows through it."""
     flat = matrices.detach().reshape(-1, 9)
-    if flat.is_cuda:
+    if not takes_kernels(flat):
         return _nearest_quaternions_plain(flat).reshape(*matrices.shape[:-2], 4)
     quaternions = _nearest_quaternions(flat.float().contiguous().numpy())
     return torch.from_numpy(quaternions).to(matrices).reshape(*matrices.shape[:-2], 4)
 
 
 def _nearest_quaternions_plain(matrices: Float[Tensor, "n 9"]) -> Float[Tensor, "n 4"]:
-    """Return the same in plain torch, for other devices."""
+    """Return the same in plain torch, on any device."""
     R = matrices.reshape(-1, 3, 3)
     for _ in range(_POLAR_STEPS):
         rows = R.unbind(1)

@@ -16,10 +16,10 @@ def peak_joint_speed(joints: Float[Tensor, "f j 3"], fps: float) -> Float[Tensor
 
     Before the first frame the body is taken to have stood still.
     """
-    speed = torch.zeros(len(joints))
+    speed = joints.new_zeros(len(joints))
     speed[1:] = (joints[1:] - joints[:-1]).norm(dim=-1).mean(-1) * fps
     length = round(SETTLE_SECONDS * fps)
-    padded = torch.cat([torch.zeros(length - 1), speed])
+    padded = torch.cat([speed.new_zeros(length - 1), speed])
     return padded.unfold(0, length, 1).amax(-1)
 
 
@@ -39,7 +39,7 @@ def find_rest_frames(
     for name, frames in transforms.items():
         # Where the transforms carry two points tells how fast each joint translates and turns.
         points = frames[:, :, :3, 3] + frames[:, :, :3, :3].sum(-1) * 0.3
-        scores = peak_joint_speed(points, fps)
+        scores = peak_joint_speed(points, fps).cpu()
         stillest = (int(i) for i in scores.argsort(stable=True) if usable(name, int(i)))
         candidates += [(float(scores[i]), name, i) for i in itertools.islice(stillest, per_sequence)]
     return [(name, frame) for _, name, frame in sorted(candidates)[:count]]

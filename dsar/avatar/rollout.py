@@ -88,7 +88,7 @@ def _bind(avatar: Avatar, poses: Float[Tensor, "f j 4 4"]) -> Binding:
     rows, columns = avatar.texels // width, avatar.texels % width
     # The body's chart fills its texture; charts of garments lie below it.
     uv = torch.stack([(columns + 0.5) / width, 1 - (rows + 0.5) / height], -1)
-    # Writers work on the CPU, whatever the avatar does.
+    # Writers work in main memory, wherever the avatar is.
     return Binding(
         body=avatar.body.to(device="cpu"),
         joint_names=JOINT_NAMES,
@@ -106,7 +106,8 @@ def template_sequence(sequence: GaussianSequence, avatar: Avatar, motion: Motion
     @torch.no_grad()
     def produce() -> Iterator[Gaussians]:
         for number in sequence.frame_numbers:
-            yield avatar.gaussians(signal.windows[[number - START_FRAME]], None)[0]
+            frame = number - START_FRAME
+            yield avatar.gaussians(signal.windows[frame : frame + 1], None)[0]
 
     return dataclasses.replace(sequence, produce=produce)
 

@@ -44,6 +44,7 @@ class Check(Common):
         from dsar.evaluation.check import check_capture, draw_overlays
         from dsar_render import write_contact_sheet
 
+        self.chosen_device()
         capture = open_capture(
             self.capture, body=self.body, train_frames=self.train_frames, test_frames=self.test_frames
         )

@@ -6,7 +6,7 @@ import re
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
@@ -15,18 +15,18 @@ from dsar.errors import ConfigError
 from dsar.types import GaussianSequence
 
 if TYPE_CHECKING:
+    import torch
+
     from dsar.data.captures.multiview import MultiViewCapture
     from dsar.training.scene import Scene
-
-Device = Literal["auto", "cpu", "cuda"]
 
 
 @dataclass(frozen=True)
 class Common(ABC):
     """Flags of every command."""
 
-    device: Device = "auto"
-    """Where to compute."""
+    device: str = "auto"
+    """Where to compute: cpu, cuda or cuda:N; auto: a GPU if there is one. Pictures are drawn on the CPU."""
     progress: ProgressStyle = "auto"
     """How to show progress."""
     json: Path | None = None
@@ -61,10 +61,11 @@ class Common(ABC):
         for path in self.output_folders():
             check_folder_writable(path)
 
-    def check_device(self) -> None:
-        """Raise ConfigError where the device is not supported."""
-        if self.device == "cuda":
-            raise ConfigError("--device cuda: this version computes on the CPU only; leave --device out")
+    def chosen_device(self) -> "torch.device":
+        """Return the device that --device names; a ConfigError where it is not there."""
+        from dsar.devices import choose_device
+
+        return choose_device(self.device)
 
     def write_json(self, content: dict) -> None:
         """Write the --json file, if one was asked for."""

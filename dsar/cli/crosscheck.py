@@ -12,6 +12,8 @@ from dsar.errors import ConfigError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    import torch
+
     from dsar.data.captures.formats import MultiViewCapture
     from dsar.training.scene import Scene
     from dsar.types import Body, Gaussians
@@ -55,12 +57,12 @@ class Crosscheck(RunCommand):
             write_crosscheck_report,
         )
 
-        self.check_device()
+        device = self.chosen_device()
         if self.run_folder is not None and self.capture is not None:
             raise ConfigError("dsar crosscheck: expected a run or --capture, found both: give one of them")
         if self.body is not None and self.capture is None:
             raise ConfigError("--body: expected with --capture; a run has its own")
-        capture, body, drive, page = self.open()
+        capture, body, drive, page = self.open(device)
         shapes = [self.posed(capture, body)]
         cameras = list(capture.cameras)
         projections = read_back_projections(cameras)
@@ -87,7 +89,9 @@ class Crosscheck(RunCommand):
         if not verdict.passed:
             raise SystemExit(1)
 
-    def open(self) -> "tuple[MultiViewCapture | Scene, Body, Callable[[], Gaussians] | None, Path]":
+    def open(
+        self, device: "torch.device"
+    ) -> "tuple[MultiViewCapture | Scene, Body, Callable[[], Gaussians] | None, Path]":
         """Return cameras and motions, the body, what makes a run's Gaussians of the frame, and the page."""
         from dsar.avatar import roll_out
         from dsar.avatar.rollout import START_FRAME
@@ -99,15 +103,15 @@ class Crosscheck(RunCommand):
             capture = open_capture(self.capture, body=self.body)
             return capture, capture.body, None, _PAGES / f"{file_stem(capture.name)}.crosscheck.html"
         run = Run(self.chosen_run())
-        avatar, config, _ = load_checkpoint(run)
+        avatar, config, _ = load_checkpoint(run, device)
         scene = open_scene(run, config)
         motion = scene.motions[self.sequence(scene)]
 
         def drive() -> "Gaussians":
-            _, gaussians = next(iter(roll_out(avatar, motion, frames=[START_FRAME + self.frame])))
-            return gaussians.detach()
+            frames = roll_out(avatar, motion, frames=[START_FRAME + self.frame]).in_main_memory()
+            return next(iter(frames))[1].detach()
 
-        return scene, avatar.body, drive, run.folder / "crosscheck.html"
+        return scene, avatar.body.to(device="cpu"), drive, run.folder / "crosscheck.html"
 
     def sequence(self, capture: "MultiViewCapture | Scene") -> str:
         """Return the sequence whose pose is shown; check that it has the frame."""

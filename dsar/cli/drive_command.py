@@ -47,11 +47,11 @@ class DrivenAvatar:
         return self.roll_out()
 
     def roll_out(self, frames: Sequence[int] | None = None) -> GaussianSequence:
-        """Return the Gaussians of some frames, all by default."""
+        """Return the Gaussians of some frames, all by default; in main memory, wherever the avatar is."""
         from dsar.avatar import roll_out
 
         given = {"delivered": self.delivered, "provenance": self.provenance}
-        return roll_out(self.avatar, self.motion, frames=frames, **given)
+        return roll_out(self.avatar, self.motion, frames=frames, **given).in_main_memory()
 
 
 @dataclass(frozen=True)
@@ -97,11 +97,13 @@ class DriveCommand(RunCommand):
         from dsar.training.checkpoint import Run, load_checkpoint
         from dsar.training.scene import open_scene
 
-        self.check_device()
+        device = self.chosen_device()
         torch.set_num_threads(1)
         fps = None if self.fps is None else parse_rate(self.fps)
         run, file = Run(self.chosen_run()), self.motion_file()
-        avatar, config, provenance = load_checkpoint(run)
+        avatar, config, provenance = load_checkpoint(run, device)
+        body = avatar.body.to(device="cpu")
+        body = avatar.body.to(device="cpu")
         scene, training = cache(partial(open_scene, run, config)), None
         if file is None:
             self._refuse_file_flags(self.motion)
@@ -109,7 +111,7 @@ class DriveCommand(RunCommand):
             source_hash = _hash(motion)
         else:
             training = _training_motions(scene, file.stem)
-            motion = self._read_motion_file(file, avatar.body)
+            motion = self._read_motion_file(file, body)
             source_hash = _digest(file.read_bytes())
         provenance["motion_hash"] = _hash(motion)
         driven = delivered = resample(motion, avatar.fps)
@@ -117,7 +119,7 @@ class DriveCommand(RunCommand):
             delivered = resample(motion, fps)
             provenance["fps"] = str(exact_rate(fps))
         if training is not None:
-            log_out_of_distribution(avatar.body, delivered, training, START_FRAME)
+            log_out_of_distribution(body, delivered, training, START_FRAME)
         settings = _digest(repr(config.model).encode())
         inputs = {"checkpoint": provenance["checkpoint"], "model": settings, "motion": source_hash}
         return DrivenAvatar(avatar, driven, delivered, scene, provenance, inputs)

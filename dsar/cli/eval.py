@@ -68,14 +68,14 @@ class Eval(RunCommand):
         from dsar.evaluation.study import ABLATIONS, BASELINES, Study, summarize_tables, to_markdown
         from dsar.evaluation.study.chart import chart_points, draw_chart, training_length_series
 
-        self.check_device()
+        device = self.chosen_device()
         every = ABLATIONS | BASELINES
         tables = (ABLATIONS if self.ablations else {}) | (BASELINES if self.baselines else {})
         if unknown := set(self.tables) - set(tables):
             raise ConfigError(f"no table {', '.join(sorted(unknown))}; there are {', '.join(tables)}")
         tables = {name: table for name, table in tables.items() if name in self.tables or not self.tables}
         capture = absolute_capture(self.capture)
-        study = Study(self.study, self.steps, capture)
+        study = Study(self.study, self.steps, capture, device=device)
         with ProgressBar(self.progress, "study").running() as bar:
             complete = study.run(list(tables.values()), self.hours, lambda what, share: bar.show(share, what))
         summary = summarize_tables(study, tables)
@@ -99,13 +99,13 @@ class Eval(RunCommand):
         from dsar.training.checkpoint import Run, load_checkpoint
         from dsar.training.scene import open_images
 
-        self.check_device()
+        device = self.chosen_device()
         run = Run(self.chosen_run())
-        avatar, config, _ = load_checkpoint(run)
+        avatar, config, _ = load_checkpoint(run, device)
         figures = evaluate(avatar, open_images(run, config))
         content = figures.to_json()
         self.write_json(content)
-        write_worst(run.folder, figures.worst)
+        write_worst(run.folder, figures.worst, device)
         write_text_atomically(run.figures, json.dumps(content, indent=2) + "\n")
         write_report(run)
         for split, metrics in content["splits"].items():

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 from dsar.cli.command import resolve_sequence
 
 if TYPE_CHECKING:
+    import torch
+
     from dsar.evaluation.results import WorstView
 
 _log = logging.getLogger(__name__)
@@ -16,25 +18,28 @@ _COLUMNS = 10
 """Frames of a contact sheet."""
 
 
-def write_previews(folder: Path) -> Path:
-    """Write the contact sheet, the video and the report of a run; return the sheet's path."""
+def write_previews(folder: Path, device: "torch.device") -> Path:
+    """Write the contact sheet, the video and the report of a run; return the sheet's path.
+
+    Rollouts are computed on a device.
+    """
     from dsar.evaluation.report import write_report
     from dsar.training.checkpoint import Run
 
-    sheet = write_contact_sheet(folder)
+    sheet = write_contact_sheet(folder, device)
     if importlib.util.find_spec("imageio_ffmpeg"):
-        write_comparison(folder)
+        write_comparison(folder, device)
     else:
         _log.info('No compare.mp4: package imageio-ffmpeg is missing, pip install "dsar-avatar[video]"')
     write_report(Run(folder))
     return sheet
 
 
-def write_contact_sheet(folder: Path) -> Path:
+def write_contact_sheet(folder: Path, device: "torch.device") -> Path:
     """Write truth above prediction for some frames and cameras of the run's test motion."""
     from dsar_render import write_contact_sheet
 
-    scene = _Scene(folder)
+    scene = _Scene(folder, device)
     last = len(scene.capture.motions[scene.far]) - 1
     frames = sorted({round(i * last / (_COLUMNS - 1)) for i in range(_COLUMNS)})
     rows: dict[str, list] = {}
@@ -48,13 +53,13 @@ def write_contact_sheet(folder: Path) -> Path:
     return write_contact_sheet(folder / "previews" / "sheet.png", rows, columns=columns)
 
 
-def write_comparison(folder: Path) -> Path:
+def write_comparison(folder: Path, device: "torch.device") -> Path:
     """Write a video of the run's test motion, truth and avatar in turn, seen by some cameras."""
     import numpy as np
 
     from dsar_render import write_mp4
 
-    scene = _Scene(folder)
+    scene = _Scene(folder, device)
     motion, cameras = scene.capture.motions[scene.far], scene.some_cameras()[:2]
 
     def pictures() -> Iterator[np.ndarray]:
@@ -70,11 +75,11 @@ def write_comparison(folder: Path) -> Path:
     return path
 
 
-def write_worst(folder: Path, views: "Sequence[WorstView]") -> Path:
+def write_worst(folder: Path, views: "Sequence[WorstView]", device: "torch.device") -> Path:
     """Write truth above prediction for views of held-out sequences."""
     from dsar_render import write_contact_sheet
 
-    scene, pairs = _Scene(folder), {}
+    scene, pairs = _Scene(folder, device), {}
     for name in dict.fromkeys(view.sequence for view in views):
         wanted = {(view.frame, view.camera) for view in views if view.sequence == name}
         frames, cameras = (sorted({pair[axis] for pair in wanted}) for axis in (0, 1))
@@ -92,13 +97,13 @@ def write_worst(folder: Path, views: "Sequence[WorstView]") -> Path:
 class _Scene:
     """A run's avatar and its capture, and images of both as they are shown: over white, 8 bits."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, device: "torch.device") -> None:
         from dsar.avatar.rollout import START_FRAME
         from dsar.training.checkpoint import Run, load_checkpoint
         from dsar.training.scene import open_images
 
         run = Run(folder)
-        self.avatar, config, _ = load_checkpoint(run)
+        self.avatar, config, _ = load_checkpoint(run, device)
         self.capture, self.first = open_images(run, config), START_FRAME
         self.far = resolve_sequence(self.capture, "test") or ""
 
@@ -130,9 +135,8 @@ class _Scene:
         numbers = [self.first + frame for frame in frames]
         motion = self.capture.motions[sequence]
         chosen = [self.capture.cameras[camera] for camera in cameras]
-        rendered = render_sequence(
-            roll_out(self.avatar, motion, frames=numbers), chosen, background=torch.ones(3)
-        )
+        rollout = roll_out(self.avatar, motion, frames=numbers).in_main_memory()
+        rendered = render_sequence(rollout, chosen, background=torch.ones(3))
         index = {camera.name: number for number, camera in zip(cameras, chosen, strict=True)}
         for number, camera, output in rendered:
             yield number - self.first, index[camera.name], display_image(output)

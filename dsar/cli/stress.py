@@ -25,9 +25,9 @@ class Stress(RunCommand):
         from dsar.training.checkpoint import Run, load_checkpoint
         from dsar.training.scene import open_scene
 
-        self.check_device()
+        device = self.chosen_device()
         run = Run(self.chosen_run())
-        avatar, config, _ = load_checkpoint(run)
+        avatar, config, _ = load_checkpoint(run, device)
         scene = open_scene(run, config)
         verdicts = stress(avatar, scene.motions[resolve_sequence(scene, "test") or ""], CASES)
         cases = {}

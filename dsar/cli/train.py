@@ -101,7 +101,7 @@ class Train(Common):
         from dsar.training.loop import train
         from dsar.training.report import Report
 
-        self.check_device()
+        device = self.chosen_device()
         run, config = Run(self.folder), self.config()
         if not run.checkpoint.exists():
             refuse_unusable_images(capture_of(config).with_cameras(config.cameras))
@@ -114,7 +114,7 @@ class Train(Common):
                 numbers = f"loss {line.loss:.4f} PSNR {line.psnr:.2f} dB"
                 bar.show(line.progress, f"{line.stage} step {line.step} {numbers}{left}")
 
-            train(config, run, resume=self.resume, report=report)
-        sheet = write_previews(run.folder)
+            train(config, run, resume=self.resume, report=report, device=device)
+        sheet = write_previews(run.folder, device)
         reached = dataclasses.asdict(last[-1] if last else read_progress(run))
         self.write_json({"run": str(run.folder), "sheet": str(sheet), **reached})

@@ -123,13 +123,13 @@ def measure_garment(
         return None
     truth = torch.from_numpy(capture.garment(sequence))
     faces = torch.from_numpy(capture.garment_faces(sequence))
-    rows = avatar.texels[garment] // avatar.atlas_size[1]
+    rows = avatar.texels[garment].cpu() // avatar.atlas_size[1]
     lowest, hem = (rows == avatar.garments[-1].rows[-1]).nonzero().squeeze(1), hem_loop(truth[0], faces)
     motion = capture.motions[sequence]
     rollout = roll_out(avatar, motion)
     sequences = {"predicted": rollout, "template": template_sequence(rollout, avatar, motion)}
     clouds = {
-        name: (torch.stack([gaussians.means[garment] for _, gaussians in frames]), lowest)
+        name: (torch.stack([gaussians.means[garment] for _, gaussians in frames]).cpu(), lowest)
         for name, frames in sequences.items()
     }
     if runs > 1:

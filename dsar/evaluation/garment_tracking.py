@@ -83,7 +83,7 @@ def track_garment(
     transforms = {name: _transforms(avatar, capture.motions[name]) for name in truths}
     frames = find_rest_frames(transforms, capture.fps, REST_FRAMES, PER_SEQUENCE, lambda *_: True)
     poses = torch.stack([transforms[name][frame] for name, frame in frames])
-    clouds = torch.stack([torch.from_numpy(truths[name][frame]) for name, frame in frames])
+    clouds = torch.stack([torch.from_numpy(truths[name][frame]) for name, frame in frames]).to(avatar.device)
     texels, shares = _nearest_texels(avatar, poses, clouds)
     weights = (avatar.texel_weights[texels] * shares[..., None]).sum(1)
     points = torch.stack([_unskin(cloud, weights, pose) for cloud, pose in zip(clouds, poses, strict=True)])
@@ -105,7 +105,8 @@ def check_same_points(counts: Mapping[str, int], name: str) -> None:
 
 
 def _transforms(avatar: Avatar, motion: Motion) -> Float[Tensor, "f j 4 4"]:
-    return forward_kinematics(avatar.body, motion.rotations, motion.translations)
+    poses = motion.rotations.to(avatar.device), motion.translations.to(avatar.device)
+    return forward_kinematics(avatar.body, *poses)
 
 
 def _nearest_texels(

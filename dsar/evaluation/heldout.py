@@ -37,7 +37,7 @@ def evaluate(
     Without one of the `streams` images and unseen motions are those of an ablated network; the garment's
     shape and times are the whole's.
     """
-    perceptual, skipped = load_perceptual()
+    perceptual, skipped = load_perceptual(avatar.device)
     by_sequence = _evaluate_sequences(avatar, capture, stride, streams, perceptual)
     skipped.setdefault("lpips_vgg", "on training sequences, for it takes long")
     if "lpips" in skipped:

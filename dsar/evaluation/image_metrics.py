@@ -37,17 +37,20 @@ def flip(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float:
 
 @torch.no_grad()
 def _lpips(model: torch.nn.Module, image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float:
-    pair = (x.clamp(0, 1).movedim(-1, 0)[None].float().cpu() for x in (image, truth))
+    pair = (x.clamp(0, 1).movedim(-1, 0)[None].float() for x in (image, truth))
     return float(model(*pair))
 
 
-def load_perceptual() -> tuple[dict[str, ImageMetric], dict[str, str]]:
-    """Return the perceptual metrics that this installation can compute, and why it cannot compute others."""
+def load_perceptual(device: torch.device) -> tuple[dict[str, ImageMetric], dict[str, str]]:
+    """Return the perceptual metrics that this installation can compute, and why it cannot compute others.
+
+    They are of images on the device.
+    """
     metrics: dict[str, ImageMetric] = {}
     skipped = {}
     for name, net in _LPIPS.items():
         if find_lpips_weights(net).exists():
-            metrics[name] = partial(_lpips, load_lpips(net))
+            metrics[name] = partial(_lpips, load_lpips(net).to(device))
         else:
             skipped[name] = "its weights are not on this machine: run tools/fetch_lpips.py"
     if importlib.util.find_spec("flip_evaluator"):

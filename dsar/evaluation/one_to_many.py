@@ -37,10 +37,10 @@ def one_to_many(
         )
         for index in sorted(cameras):
             camera = capture.cameras[index]
-            true_rest = true_view(capture, pair.sequence, rest, index)
+            true_rest = true_view(capture, pair.sequence, rest, index, avatar.device)
             predicted_rest = render_white(predicted[rest], camera)
             for frame in after_stop:
-                true = true_view(capture, pair.sequence, frame, index)
+                true = true_view(capture, pair.sequence, frame, index, avatar.device)
                 inside = (true.mask > 0.5) | (true_rest.mask > 0.5)
                 true_differences.append((true.color - true_rest.color)[inside].flatten())
                 image = render_white(predicted[frame], camera)

@@ -97,8 +97,9 @@ def time_rollout(avatar: Avatar, capture: Capture, sequence: str, frames: int = 
     times: dict[str, list[float]] = defaultdict(list)
     for frame in range(_WARM_UP + frames):
         start = read_clock()
-        motion_window = signal.windows[[frame % len(signal)]]
-        cloth = signal.cloth_at([frame % len(signal)])
+        number = frame % len(signal)
+        motion_window = signal.windows[number : number + 1]
+        cloth = signal.cloth_at(range(number, number + 1))
         maps, magnitude = avatar.standardize(avatar.input_maps(motion_window, avatar.fps, cloth))
         network_start = read_clock()
         step = partial(session.step, maps, magnitude)

@@ -94,7 +94,7 @@ def run_long(avatar: Avatar, motion: Motion, frames: int = 10_000) -> CaseVerdic
         [offset.norm(dim=-1).mean() for offset in _offsets(avatar, loop_motion(motion, rounds)[0])]
     )
     means = sizes.reshape(rounds, period).mean(1).double()
-    centred = torch.arange(rounds) - (rounds - 1) / 2
+    centred = torch.arange(rounds, device=means.device) - (rounds - 1) / 2
     slope = (centred * means).sum() / centred.square().sum() * (1000 / period) / means.mean().clamp_min(1e-9)
     return CaseVerdict(_finite(slope.abs()), 0.01, "per 1000 frames", _curve(means * _MILLIMETRES))
 
@@ -128,9 +128,10 @@ def run_twin(avatar: Avatar, motion: Motion, start: int = 30) -> CaseVerdict:
         if frame == start:
             state = state.map(torch.clone)
             memory, offsets = state.memory[1], state.offsets[1]
-            memory.copy_(torch.randn(memory.shape, generator=generator) * memory.square().mean().sqrt())
-            offsets.add_(_NOISE * torch.randn(offsets.shape, generator=generator))
-        motion_window = signal.windows[[frame]]
+            # Drawn in main memory: the same on any device.
+            memory.copy_(_noise(memory, generator) * memory.square().mean().sqrt())
+            offsets.add_(_NOISE * _noise(offsets, generator))
+        motion_window = signal.windows[frame : frame + 1]
         cloth = signal.cloth_at([frame, frame])
         output, state, _ = avatar.forward_frame(motion_window.expand(2, -1, -1, -1, -1), state, cloth)
         if frame >= start:
@@ -146,7 +147,7 @@ def run_teleport(avatar: Avatar, motion: Motion) -> CaseVerdict:
 
     The curve is the largest change frame by frame, mm.
     """
-    there = teleport_motion(motion, avatar.body, len(motion) // 2)
+    there = teleport_motion(motion, avatar.body.to(device="cpu"), len(motion) // 2)
     pairs = zip(_offsets(avatar, motion), _offsets(avatar, there), strict=True)
     apart = torch.stack([(one - other).norm(dim=-1).amax() for one, other in pairs]) * _MILLIMETRES
     return CaseVerdict(_finite(apart.amax()), 0.1, "mm", _curve(apart))
@@ -229,10 +230,15 @@ def _distance(one: Float[Tensor, "*s p 3"], other: Float[Tensor, "*s p 3"]) -> F
     return (one - other).square().sum(-1).mean(-1).sqrt() * _MILLIMETRES
 
 
+def _noise(like: Tensor, generator: torch.Generator) -> Tensor:
+    """Return standard normal numbers of a host's generator, where a tensor of that shape is."""
+    return torch.randn(like.shape, generator=generator).to(like.device)
+
+
 def _finite(value: Tensor, also: Tensor | None = None) -> float:
     sound = value.isfinite().all() and (also is None or also.isfinite().all())
     return float(value) if sound else float("inf")
 
 
 def _curve(values: Tensor) -> tuple[float, ...]:
-    return tuple(round(float(value), 4) for value in values)
+    return tuple(round(value, 4) for value in values.tolist())

@@ -34,14 +34,13 @@ class RestingGarment:
         if not avatar.garments:
             return None
         texels, size = avatar.texels_on(avatar.garments[-1:]), (-1, avatar.atlas_size[1])
-        return cls(
-            avatar.texel_positions[texels].unflatten(0, size), avatar.texel_weights[texels].unflatten(0, size)
-        )
+        return cls(*(of[texels].unflatten(0, size) for of in (avatar.texel_positions, avatar.texel_weights)))
 
     def silhouette(self, transforms: Float[Tensor, "j 4 4"], camera: Camera) -> Bool[Tensor, "h w"]:
         """Return the pixels whose centres it covers, carried by T_world_rest of the joints."""
         points = skin_points(self._positions, self._weights, transforms)
-        return rasterize_mesh(points, self._faces, camera).faces >= 0
+        # Meshes are drawn in main memory.
+        return (rasterize_mesh(points.cpu(), self._faces, camera).faces >= 0).to(points.device)
 
 
 def touched_pixels(

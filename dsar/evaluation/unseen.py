@@ -98,14 +98,17 @@ def free_points(capture: MultiViewCapture) -> Int64[Tensor, " p"]:
 def roll_out_points(
     avatar: Avatar, capture: MultiViewCapture, name: str, tracked: TrackedGarment, streams: Collection[Stream]
 ) -> tuple[Float[Tensor, "f v 3"], Float[Tensor, "f v 3"], Float[Tensor, "f j 4 4"]]:
-    """Return the garment's predicted points and the template's, world metres, and T_world_rest of joints."""
+    """Return the garment's predicted points and the template's, world metres, and T_world_rest of joints.
+
+    They are in main memory, as the truth is.
+    """
     predicted, template, transforms = [], [], []
     for motion_window, output in network_outputs(avatar, capture.motions[name], streams=streams):
         pose = motion_window[0, 0]
         predicted.append(tracked.carry(pose, tracked.offsets(avatar, output)))
         template.append(tracked.carry(pose))
         transforms.append(pose)
-    return torch.stack(predicted), torch.stack(template), torch.stack(transforms)
+    return torch.stack(predicted).cpu(), torch.stack(template).cpu(), torch.stack(transforms).cpu()
 
 
 @torch.no_grad()
@@ -125,7 +128,7 @@ def _measure(
         second = rms_error(torch.from_numpy(capture.garment(name, run=1))[:, free], true)
     stops = [
         measure_stop(stop, predicted - template, true - template, fps)
-        for stop in find_stops(avatar.body, transforms, fps)
+        for stop in find_stops(avatar.body.to(device="cpu"), transforms, fps)
     ]
     return UnseenMotion(
         mm=rms_error(predicted, true),

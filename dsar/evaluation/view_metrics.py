@@ -54,24 +54,26 @@ def evaluate_sequence(
     for number, gaussians in roll_out(avatar, motion, streams=streams):
         frame = number - START_FRAME
         if frame % stride == 0:
-            template = avatar.gaussians(signal.windows[[frame]], None)[0]
+            template = avatar.gaussians(signal.windows[frame : frame + 1], None)[0]
             for index in capture.cameras_with_image(sequence, frame):
-                camera, truth = capture.cameras[index], true_view(capture, sequence, frame, index)
+                camera = capture.cameras[index]
+                truth = true_view(capture, sequence, frame, index, avatar.device)
                 image = render_white(gaussians, camera)
                 view = compare(frame, index, image, render_white(template, camera), truth)
                 if garment is not None:
-                    inside = garment_mask(garment[0][frame], garment[1], camera) & (truth.mask > 0.5)
+                    inside = garment_mask(garment[0][frame], garment[1], camera).to(avatar.device)
+                    inside &= truth.mask > 0.5
                     if inside.any():
                         in_garment = psnr(image[inside][None], truth.color[inside][None])
                         view = dataclasses.replace(view, psnr_garment=in_garment)
                 cover = true_cover(capture, garment, sequence, frame, index)
                 if cover is not None and resting is not None:
                     at_rest = resting.silhouette(signal.transforms[frame], camera)
-                    uncovered = psnr_uncovered(image, truth, cover, at_rest)
+                    uncovered = psnr_uncovered(image, truth, cover.to(avatar.device), at_rest)
                     view = dataclasses.replace(view, psnr_uncovered=uncovered)
                 slow = frame % (_SLOW_EVERY * stride) == 0
                 if slow and before is not None and index in capture.cameras_with_image(sequence, frame - 1):
-                    last = true_view(capture, sequence, frame - 1, index)
+                    last = true_view(capture, sequence, frame - 1, index, avatar.device)
                     changes = compare_change((before, gaussians), camera, (last, truth), perceptual)
                     # The first frame has none before it.
                     round_number = frame // (_SLOW_EVERY * stride) - 1
@@ -114,7 +116,7 @@ def compare(
     truth: View,
 ) -> ViewMetrics:
     """Return the metrics of one predicted view and of the template's."""
-    x0, y0, x1, y1 = mask_box(truth.mask.numpy() > 0.5, 0)
+    x0, y0, x1, y1 = mask_box(truth.mask.cpu().numpy() > 0.5, 0)
     box = (slice(y0, y1), slice(x0, x1))
     return ViewMetrics(
         frame,
@@ -138,7 +140,8 @@ def compare_change(
     al. 2020).
     """
     before, now = (
-        rasterize(moment, camera, background=WHITE, outputs=("contributors",)) for moment in gaussians
+        rasterize(moment, camera, background=WHITE.to(moment.means), outputs=("contributors",))
+        for moment in gaussians
     )
     metrics = {"tpsnr": temporal_psnr((before.color, now.color), (truths[0].color, truths[1].color))}
     if "lpips" in perceptual:

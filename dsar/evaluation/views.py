@@ -23,18 +23,20 @@ class View:
     """Alpha of the truth."""
 
 
-def true_view(capture: Capture, sequence: str, frame: int, camera: int) -> View:
-    """Return a true image over white."""
-    pixels = torch.tensor(capture.image(sequence, frame, camera)).float() / 255
+def true_view(
+    capture: Capture, sequence: str, frame: int, camera: int, device: torch.device | None = None
+) -> View:
+    """Return a true image over white, on the device of what it is compared with (None: the CPU)."""
+    pixels = torch.tensor(capture.image(sequence, frame, camera), device=device).float() / 255
     alpha = pixels[..., 3]
     return View(pixels[..., :3] * alpha[..., None] + (1 - alpha[..., None]), alpha)
 
 
 def render_white(gaussians: Gaussians, camera: Camera) -> Float[Tensor, "h w 3"]:
     """Return an image over white."""
-    return rasterize(gaussians, camera, background=WHITE).color
+    return rasterize(gaussians, camera, background=WHITE.to(gaussians.means)).color
 
 
 def to_bytes(image: Float[Tensor, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
     """Return an image as 8-bit numbers."""
-    return (image.clamp(0, 1) * 255).round().byte().numpy()
+    return (image.clamp(0, 1) * 255).round().byte().cpu().numpy()

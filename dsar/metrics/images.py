@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
+from dsar.devices import send
+
 _SSIM_WINDOW, _SSIM_SIGMA = 11, 1.5
 
 
@@ -28,7 +30,7 @@ def ssim(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> Float
     x, y = image.permute(2, 0, 1), target.permute(2, 0, 1)
     moments = torch.cat([x, y, x * x, y * y, x * y])
     # As two products with banded matrices, four times faster than single-channel convolutions.
-    rows, columns = (_blur_matrix(size).to(image) for size in image.shape[:2])
+    rows, columns = (_blur_matrix(size, image.dtype, image.device) for size in image.shape[:2])
     moments = rows @ moments @ columns.mT
     mx, my, mxx, myy, mxy = moments.chunk(5)
     vx, vy, vxy = mxx - mx * mx, myy - my * my, mxy - mx * my
@@ -38,12 +40,12 @@ def ssim(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> Float
 
 
 @lru_cache(maxsize=512)
-def _blur_matrix(size: int) -> Float[Tensor, "s s"]:
+def _blur_matrix(size: int, dtype: torch.dtype, device: torch.device) -> Float[Tensor, "s s"]:
     """Return the matrix that blurs a line of pixels with SSIM's window, zero outside."""
     distance = torch.arange(size)[:, None] - torch.arange(size)
     window = torch.exp(-(distance**2) / (2 * _SSIM_SIGMA**2)) * (distance.abs() <= _SSIM_WINDOW // 2)
     reach = torch.arange(_SSIM_WINDOW) - _SSIM_WINDOW // 2
-    return window / torch.exp(-(reach**2) / (2 * _SSIM_SIGMA**2)).sum()
+    return send((window / torch.exp(-(reach**2) / (2 * _SSIM_SIGMA**2)).sum()).to(dtype), device)
 
 
 def mask_box(alpha: Shaped[np.ndarray, "h w"], margin: int) -> tuple[int, int, int, int]:

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from dsar.devices import takes_kernels
 from dsar.network.decoder import Decoder
 from dsar.network.layers import Upsample, activate, channels_last
 from dsar.network.model import DualStreamNetwork
@@ -53,7 +54,7 @@ def frozen_copy(network: DualStreamNetwork, precision: torch.dtype | None) -> Du
     """
     network = copy.deepcopy(network)
     small = network.grid[0] * network.grid[1] <= _SMALL_GRID
-    if network.occupied.device.type == "cpu" and small and isinstance(network.decoder, Decoder):
+    if takes_kernels(network.occupied) and small and isinstance(network.decoder, Decoder):
         ups = [up for up in network.decoder.ups if isinstance(up, Upsample)]
         network.decoder.ups = nn.ModuleList(map(ShuffledUpsample, ups))
         head = network.decoder.head

@@ -1,6 +1,6 @@
 """The network of the paper's section 3.4: one step of the autoregression for a batch of rollouts."""
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 
 import torch
@@ -32,11 +32,10 @@ class NetworkOutput:
     features: tuple[Float[Tensor, "b _ _ _"], ...]
     """The aggregated hierarchy F, finest level first."""
 
-    def select(self, rollouts: Sequence[int]) -> "NetworkOutput":
+    def select(self, rollouts: Int64[Tensor, " k"]) -> "NetworkOutput":
         """Return the output of some rollouts of the batch."""
-        index = list(rollouts)
-        features = tuple(feature[index] for feature in self.features)
-        return NetworkOutput(self.offset[index], self.appearance[index], features)
+        features = tuple(feature[rollouts] for feature in self.features)
+        return NetworkOutput(self.offset[rollouts], self.appearance[rollouts], features)
 
 
 class DualStreamNetwork(nn.Module):

@@ -87,7 +87,7 @@ class InferenceSession:
         the output of the step before.
         """
         # The first frame fills the rings, which no recorded step does.
-        if not maps.is_cuda or not self._started or self._eager_steps < _WARMUP_STEPS:
+        if maps.device.type == "cpu" or not self._started or self._eager_steps < _WARMUP_STEPS:
             self._eager_steps += 1
             return self._compute_step(maps, magnitude)
         if self._graph is None or self._inputs is None:

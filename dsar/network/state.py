@@ -60,7 +60,8 @@ def fill_where_fresh(
     fresh: Bool[Tensor, " b"], newest: Float[Tensor, "b *s"], entries: Float[Tensor, "b n *s"]
 ) -> Float[Tensor, "b n *s"]:
     """Return the entries, or copies of the newest one for rollouts that have no history yet."""
-    if not fresh.any():
+    # On a GPU the host would have to wait to know.
+    if fresh.device.type == "cpu" and not fresh.any():
         return entries
     mask = fresh.reshape(-1, *[1] * (entries.ndim - 1))
     return torch.where(mask, newest[:, None], entries)

@@ -84,21 +84,29 @@ def estimate(config: TrainConfig) -> Budget:
     return Budget(memory, counter.get_total_flops(), parameters)
 
 
-def check_budget(config: TrainConfig, processes: int, done: float = 0.0, images: int = 0) -> Budget:
+def check_budget(
+    config: TrainConfig,
+    processes: int,
+    done: float = 0.0,
+    images: int = 0,
+    device: torch.device | None = None,
+) -> Budget:
     """Return the estimate of a run that fits this machine.
 
     Args:
         config: Its settings.
         processes: Workers on this machine.
         done: Share of the schedule that an earlier part of the run has done.
-        images: Bytes of decoded images that a worker keeps.
+        images: Bytes of decoded images that a worker keeps in main memory.
+        device: Where it computes; None: the CPU.
 
     Raises:
         ConfigError: it does not fit, with what to change.
     """
-    budget, memory = estimate(config), available_memory()
-    needed = (budget.memory + images) * processes
-    where = f"preset {config.preset}, {processes} worker(s) here"
+    device = device or torch.device("cpu")
+    budget, memory = estimate(config), available_memory(device)
+    needed = (budget.memory + images * (device.type != "cuda")) * processes
+    where = f"preset {config.preset}, {processes} worker(s) on {device}"
     if memory is not None and needed > memory:
         raise ConfigError(
             f"training ({where}) needs about {needed / 2**30:.1f} GiB, {memory / 2**30:.1f} GiB are free; "
@@ -106,7 +114,7 @@ def check_budget(config: TrainConfig, processes: int, done: float = 0.0, images:
             f"{config.schedule.rollouts_per_worker} rollout(s): lower --schedule.chunk-frames, "
             "--schedule.rollouts-per-worker or --workers, or take --model.wiring perframe or --preset small"
         )
-    seconds = budget.flop / measure_flops()
+    seconds = budget.flop / measure_flops(device)
     # The template's updates do not run the network.
     share = min(1 - done, 1 - config.schedule.template_fraction)
     days = seconds * share * config.schedule.steps / 86400
@@ -119,8 +127,10 @@ def check_budget(config: TrainConfig, processes: int, done: float = 0.0, images:
     return dataclasses.replace(budget, seconds=seconds)
 
 
-def available_memory() -> int | None:
-    """Return the bytes that processes may still take, where the system tells (Linux)."""
+def available_memory(device: torch.device | None = None) -> int | None:
+    """Return the bytes that processes may still take: of a GPU, or of main memory where Linux tells."""
+    if device is not None and device.type == "cuda":
+        return torch.cuda.mem_get_info(device)[0]
     limits = []
     meminfo, cgroup = Path("/proc/meminfo"), Path("/sys/fs/cgroup")
     if meminfo.exists():
@@ -135,17 +145,20 @@ def available_memory() -> int | None:
     return min(limits, default=None)
 
 
-def measure_flops() -> float:
+def measure_flops(device: torch.device | None = None) -> float:
     """Return the floating-point operations a second of a convolution like the network's, in one thread."""
-    layer, x = nn.Conv2d(64, 64, 3, padding=1), torch.rand(4, 64, 64, 64)
+    layer, x = nn.Conv2d(64, 64, 3, padding=1).to(device), torch.rand(4, 64, 64, 64, device=device)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
         with torch.no_grad():
-            layer(x)
+            y = layer(x)
+            y[0, 0, 0, 0].item()
             start = time.perf_counter()
             for _ in range(_REPEATS):
-                layer(x)
+                y = layer(x)
+            # Read, for a GPU works behind the host's back.
+            y[0, 0, 0, 0].item()
             seconds = time.perf_counter() - start
     finally:
         torch.set_num_threads(threads)

@@ -192,10 +192,13 @@ def _located(run: Run, recorded: str, what: str) -> str:
     return str(located)
 
 
-def load_checkpoint(run: Run) -> tuple[Avatar, TrainConfig, dict[str, str]]:
+def load_checkpoint(
+    run: Run, device: torch.device | str = "cpu"
+) -> tuple[Avatar, TrainConfig, dict[str, str]]:
     """Return the trained avatar of a run, its settings, and its provenance for exported files.
 
-    Moving or renaming the run changes none of them but the places of capture and body.
+    The avatar is on the `device`, wherever it was trained. Moving or renaming the run changes none of them
+    but the places of capture and body.
 
     Raises:
         CheckpointError: there is no checkpoint, or one of its files is damaged, foreign or not finite.
@@ -209,7 +212,7 @@ def load_checkpoint(run: Run) -> tuple[Avatar, TrainConfig, dict[str, str]]:
     with reading(path):
         content = path.read_bytes()
         tensors = rename_tensors(_tensors(content), progress.format_version)
-        avatar = _avatar(tensors, config, path)
+        avatar = _avatar(tensors, config, path).to(device)
     name = Path(progress.folder).name if progress.folder else run.folder.resolve().name
     digest = hashlib.sha256(content).hexdigest()[:16]
     return avatar, config, {"checkpoint": digest, "run": name, "step": str(progress.step)}
@@ -337,6 +340,6 @@ def replace_folder(new: Path, final: Path) -> None:
     shutil.rmtree(old, ignore_errors=True)
 
 
-def load(folder: str | Path) -> Avatar:
-    """Return the trained avatar of a run folder."""
-    return load_checkpoint(Run(Path(folder)))[0]
+def load(folder: str | Path, device: torch.device | str = "cpu") -> Avatar:
+    """Return the trained avatar of a run folder, on a device."""
+    return load_checkpoint(Run(Path(folder)), device)[0]

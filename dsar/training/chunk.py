@@ -1,6 +1,7 @@
 """One update's worth of work: a chunk of K frames of several rollouts, rendered and compared."""
 
 import dataclasses
+import math
 import os
 from collections import defaultdict
 from collections.abc import Collection, Mapping
@@ -14,6 +15,7 @@ from torch import Tensor, nn
 from dsar.avatar.driving import DrivingSignal
 from dsar.avatar.mirror import Mirror
 from dsar.config import TrainConfig
+from dsar.devices import send
 from dsar.errors import TrainingError
 from dsar.network import STREAMS, NetworkOutput, Stream
 from dsar.raster import rasterize, reduced_dilation
@@ -68,8 +70,9 @@ class ChunkTrainer:
         """
         self.config, self.state, self.avatar = config, state, state.avatar
         self.lpips = lpips
-        self.loader = TargetLoader(views, max(1, (os.cpu_count() or 1) // config.workers))
-        avatar = state.avatar
+        avatar, self.device = state.avatar, state.avatar.device
+        self.loader = TargetLoader(views, self.device, max(1, (os.cpu_count() or 1) // config.workers))
+        self._shown = False
         self.mirror = Mirror(avatar.control) if config.schedule.mirrored_fraction else None
         self.drive(signals)
 
@@ -85,18 +88,18 @@ class ChunkTrainer:
         frames = [rest.frames[index] for index in chosen]
         targets = [self.loader.request(rng, name, frame, reduction, views) for name, frame in frames]
         count = max(sum(map(len, targets)), 1)
-        loss, mse = count * rest.loss(self.avatar, self.config.loss), torch.zeros(())
+        loss, mse = count * rest.loss(self.avatar, self.config.loss), self._zero()
         for index, (name, frame), frame_targets in zip(chosen, frames, targets, strict=True):
             output = rest.output(self.avatar, int(index))
-            gaussians = self.avatar.gaussians(self.signals[name].windows[[frame]], output)[0]
+            gaussians = self.avatar.gaussians(self.signals[name].windows[frame : frame + 1], output)[0]
             view = self._views(rng, gaussians, frame_targets, reduction)
             loss, mse = loss + view[0], mse + view[1]
         return self._backward(loss, mse, count)
 
     def backward_pretraining(self, rng: np.random.Generator) -> UpdateMetrics:
         """Step every rollout by K frames and back-propagate the distance to the registered maps."""
-        self.avatar.unhide_covered_texels()
-        loss = torch.zeros(())
+        self._show_whole_body()
+        loss = self._zero()
         for _ in range(self.config.schedule.chunk_frames):
             step = self._step(*self.state.rollouts.next_frames(rng, WHOLE_CLIP), streams=STREAMS)
             loss = loss + self._registered_distance(step) + self._residual(step)
@@ -111,11 +114,11 @@ class ChunkTrainer:
         The whole body is shown. L_total has losses over space and to registered maps besides. With `probe`,
         report how the gradients of the losses compare.
         """
-        self.avatar.unhide_covered_texels()
+        self._show_whole_body()
         schedule = self.config.schedule
         streams = STREAMS if schedule_state.stage == "autoregressive" else ()
-        losses: dict[str, Tensor] = defaultdict(lambda: torch.zeros(()))
-        mse, count = torch.zeros(()), 0
+        losses: dict[str, Tensor] = defaultdict(self._zero)
+        mse, count = self._zero(), 0
         for _ in range(schedule.chunk_frames):
             cursors, fresh = self.state.rollouts.next_frames(rng, schedule_state.max_rollout_frames)
             rendered = [i for i in range(len(cursors)) if rng.random() < schedule.rendered_fraction]
@@ -138,16 +141,22 @@ class ChunkTrainer:
         metrics = self._backward(torch.stack(list(losses.values())).sum(), mse, max(count, 1))
         return dataclasses.replace(metrics, gradients=gradients)
 
+    def _show_whole_body(self) -> None:
+        # Asked once, for the answer makes the host wait for a GPU.
+        if not self._shown:
+            self.avatar.unhide_covered_texels()
+            self._shown = True
+
     def _step(self, cursors: list[RolloutCursor], fresh: list[bool], *, streams: Collection[Stream]) -> _Step:
         """Step every rollout by one frame, some of them afresh."""
         state = self.state
-        state.network = state.network.restart(torch.tensor(fresh))
+        state.network = state.network.restart(send(torch.tensor(fresh), self.device))
         driving = self.driving.gather(cursors)
         output, state.network = self.avatar.network(
             driving.maps, driving.magnitude, state.network, streams=streams
         )
         output = dataclasses.replace(output, offset=output.offset + driving.base)
-        mirrored = torch.tensor([cursor.mirrored for cursor in cursors])
+        mirrored = send(torch.tensor([cursor.mirrored for cursor in cursors]), self.device)
         unmirrored = self.mirror.unmirror(output, mirrored) if self.mirror is not None else output
         cursors = [dataclasses.replace(cursor) for cursor in cursors]
         state.rollouts.advance()
@@ -157,7 +166,8 @@ class ChunkTrainer:
         """Return the posed Gaussians of some rollouts, as they were filmed."""
         places = [step.cursors[index] for index in rollouts]
         windows = torch.stack([self.signals[c.sequence].windows[c.frame, :1] for c in places])
-        return self.avatar.gaussians(windows, step.unmirrored_output.select(rollouts))
+        which = send(torch.tensor(rollouts), self.device)
+        return self.avatar.gaussians(windows, step.unmirrored_output.select(which))
 
     def _detach_state(self) -> None:
         """Cut what the rollouts carry on from the graph of this chunk."""
@@ -168,9 +178,9 @@ class ChunkTrainer:
         self, rng: np.random.Generator, gaussians: Gaussians, targets: list[Future[Target]], reduction: int
     ) -> tuple[Tensor, Tensor]:
         """Return summed loss and squared error of some views on a random background."""
-        loss, mse = torch.zeros(()), torch.zeros(())
+        loss, mse = self._zero(), self._zero()
         for target in (future.result() for future in targets):
-            background = torch.from_numpy(rng.random(3, np.float32))
+            background = send(torch.from_numpy(rng.random(3, np.float32)), self.device)
             output = rasterize(
                 gaussians, target.camera, background=background, dilation=reduced_dilation(reduction)
             )
@@ -200,18 +210,20 @@ class ChunkTrainer:
     def _residual(self, step: _Step) -> Tensor:
         """Return what it costs to move the garments away from the motion prior."""
         if self.avatar.prior is None:
-            return torch.zeros(())
+            return self._zero()
         residual = self.avatar.gather_control_points(step.output.offset - step.driving.base)
         garment = residual[:, self.avatar.garment_control_points()] * CENTIMETRES
         return self.config.loss.residual * garment.square().sum(-1).mean()
 
     def _compare_gradients(self, losses: Mapping[str, Tensor]) -> dict[str, float] | None:
-        weight, norms = self.avatar.network.encoder.pyramid.first.weight, {}
-        for name, loss in losses.items():
-            # A loss that is switched off, or of frames without a past, is a constant.
-            if loss.requires_grad:
-                (gradient,) = torch.autograd.grad(loss, weight, retain_graph=True, materialize_grads=True)
-                norms[name] = float(gradient.norm())
+        weight = self.avatar.network.encoder.pyramid.first.weight
+        # A loss that is switched off, or of frames without a past, is a constant.
+        names = [name for name, loss in losses.items() if loss.requires_grad]
+        gradients = [
+            torch.autograd.grad(losses[name], weight, retain_graph=True, materialize_grads=True)[0].norm()
+            for name in names
+        ]
+        norms = dict(zip(names, torch.stack([self._zero(), *gradients]).tolist()[1:], strict=True))
         render = norms.pop("render", 0.0)
         return {name: norm / render for name, norm in norms.items()} if render else None
 
@@ -231,13 +243,17 @@ class ChunkTrainer:
 
     def _backward(self, loss: Tensor, mse: Tensor | None, count: int) -> UpdateMetrics:
         loss = loss / count
-        if not loss.isfinite():
+        # Read together: the host waits for a GPU once.
+        value, error = torch.stack([loss.detach(), mse if mse is not None else self._zero()]).tolist()
+        if not math.isfinite(value):
             raise TrainingError(
-                f"the loss is {float(loss.detach())}; "
-                f"first tensor that is not finite: {self._first_not_finite()}"
+                f"the loss is {value}; first tensor that is not finite: {self._first_not_finite()}"
             )
         loss.backward()
-        return UpdateMetrics(float(loss.detach()), float(mse) / count if mse is not None else None)
+        return UpdateMetrics(value, error / count if mse is not None else None)
+
+    def _zero(self) -> Tensor:
+        return torch.zeros((), device=self.device)
 
     def _first_not_finite(self) -> str:
         state = {f"state.{name}": value for name, value in self.state.rollout_tensors().items()}

@@ -16,6 +16,7 @@ from dsar.avatar.avatar import Avatar
 from dsar.avatar.driving import DrivingSignal
 from dsar.avatar.mirror import Mirror, mirror_motion
 from dsar.body.skinning import blend_transforms
+from dsar.devices import send
 from dsar.training.rollouts import RolloutCursor
 
 CAPACITY = 1 << 28
@@ -79,20 +80,22 @@ class DrivingMaps:
         cloth = [signal.cloth for signal in self._signals.values() if signal.cloth is not None]
         parts = []
         for image in range(1 + mirrored):
-            for frames in torch.arange(self._frames).split(_BATCH):
+            for first in range(0, self._frames, _BATCH):
+                frames = slice(first, first + _BATCH)
                 seen = torch.cat(cloth)[frames] if cloth else None
-                parts.append(self._make(windows[frames], seen, torch.full((len(frames),), bool(image))))
+                which = windows.new_full((len(windows[frames]),), bool(image), dtype=torch.bool)
+                parts.append(self._make(windows[frames], seen, which))
         self._table = _joined(parts)
 
     def gather(self, cursors: Sequence[RolloutCursor]) -> DrivingFrames:
         """Return what drives each rollout where it stands."""
         if self._table is not None:
             rows = [self._starts[c.sequence] + c.frame + self._frames * c.mirrored for c in cursors]
-            return self._table.index_select(torch.tensor(rows))
+            return self._table.index_select(send(torch.tensor(rows), self._avatar.device))
         windows = torch.stack([self._signals[c.sequence].windows[c.frame] for c in cursors])
         cloth = [self._signals[c.sequence].cloth_at([c.frame]) for c in cursors]
         seen = [frame for frame in cloth if frame is not None]
-        mirrored = torch.tensor([c.mirrored for c in cursors])
+        mirrored = send(torch.tensor([c.mirrored for c in cursors]), self._avatar.device)
         return self._make(windows, torch.cat(seen) if seen else None, mirrored)
 
     @torch.no_grad()

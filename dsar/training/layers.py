@@ -81,10 +81,11 @@ class Layers:
         self.views, self.capture = views, views.capture
         self.avatar, self.maps = avatar, maps
         self.signals, self.clips = signals, clips
+        # All of it in main memory, once a run: meshes are drawn there.
         self.garment = avatar.garment_texels()
         rows = sum(len(chart.rows) for chart in avatar.garments)
         self.tube = tube_faces(rows, avatar.atlas_size[1])
-        self.body = avatar.body
+        self.body = avatar.body.to(device="cpu")
         self.texel_at = _texel_lookup(avatar)
 
     @torch.no_grad()
@@ -103,7 +104,7 @@ class Layers:
         covered = (found.covered > 0) & self._coverable()
         seen = found.pixels >= FEWEST
         colors = found.colors / found.weights.clamp_min(1e-6)[:, None]
-        avatar.fix_looks(covered, colors, seen)
+        avatar.fix_looks(*(found.to(avatar.device) for found in (covered, colors, seen)))
         fixed = int(avatar.texel_beneath.sum())
         LOGGER.info(
             "Beneath the garment: %d texels, %.0f %% of them never seen without it: they look as the nearest "
@@ -141,12 +142,12 @@ class Layers:
         body = torch.zeros_like(avatar.texel_beneath)
         body[avatar.texels_on(avatar.charts[:1])] = True
         arm = avatar.texel_weights[:, arm_joints()].sum(1) >= 0.5
-        return body & ~arm & (heights <= heights[self.garment].max())
+        return (body & ~arm & (heights <= heights[self.garment].max())).cpu()
 
     def _look(self, sequence: str, frame: int, found: _Sightings) -> None:
         """Add what the views of a frame say."""
         vertices = skin_points(
-            self.body.vertices, self.body.weights, self.signals[sequence].transforms[frame]
+            self.body.vertices, self.body.weights, self.signals[sequence].transforms[frame].cpu()
         )
         tube = self._tube(sequence, frame)
         for index in self.capture.cameras_with_image(sequence, frame):
@@ -176,9 +177,11 @@ class Layers:
         """Return the registered garment's texels in the world; None without a map."""
         if not self.maps.has_map(sequence, frame):
             return None
-        offsets = self.maps.offsets[sequence][[frame]][:, self.avatar.garment_control_points()]
-        window = self.signals[sequence].windows[[frame]]
-        return self.avatar.gaussians(window, self.avatar.offset_garment(offsets))[0].means[self.garment]
+        own = slice(frame, frame + 1)
+        offsets = self.maps.offsets[sequence][own][:, self.avatar.garment_control_points()]
+        output = self.avatar.offset_garment(offsets)
+        posed = self.avatar.gaussians(self.signals[sequence].windows[own], output)[0]
+        return posed.means[self.garment].cpu()
 
     def _texels(self, view: MeshView) -> Int64[Tensor, "h w"]:
         """Return the texel that each pixel sees of the body; -1 where there is none."""
@@ -196,7 +199,7 @@ def _texel_lookup(avatar: Avatar) -> Int64[Tensor, " g"]:
     """Return the Gaussian on each cell of the body's chart, -1 where there is none."""
     cells = torch.full((avatar.atlas_size[0] * avatar.atlas_size[1],), -1, dtype=torch.int64)
     body = avatar.texels_on(avatar.charts[:1])
-    cells[avatar.texels[body]] = body
+    cells[avatar.texels[body].cpu()] = body.cpu()
     return cells
 
 

@@ -44,10 +44,24 @@ PROBE_EVERY = 100
 """Updates between comparisons of the losses' gradients, each of which costs as much as some updates."""
 
 
-def train(config: TrainConfig, run: Run, *, resume: bool = False, report: Reporter | None = None) -> Run:
+def train(
+    config: TrainConfig,
+    run: Run,
+    *,
+    resume: bool = False,
+    report: Reporter | None = None,
+    device: torch.device | str = "cpu",
+) -> Run:
     """Train an avatar, or go on with a run; return the run, its checkpoint written.
 
     An interrupt (SIGINT) ends training after the current update with a checkpoint.
+
+    Args:
+        config: The settings of the run.
+        run: Its folder.
+        resume: Whether to go on with it, on whatever device it was trained so far.
+        report: Is told of progress.
+        device: Where to compute.
 
     Raises:
         DsarError: before any work, where settings, capture, body or run folder are not usable;
@@ -76,24 +90,31 @@ def train(config: TrainConfig, run: Run, *, resume: bool = False, report: Report
         check_same_settings(config, saved, run)
     done = read_progress(run).progress if resume else 0.0
     images = capture.kept_bytes + kept_bytes(capture)
-    budget = check_budget(config, workers.local_count(config.workers), done, images)
+    device = torch.device(device)
+    budget = check_budget(config, workers.local_count(config.workers), done, images, device)
     write_scene(run.scene, scene_of_capture(whole))
     write_text_atomically(run.config, config_to_json(config))
-    workers.run_workers(config.workers, _train, (config, run.folder, resume, budget.seconds), report)
+    arguments = config, run.folder, resume, budget.seconds, device
+    workers.run_workers(config.workers, _train, arguments, report)
     return run
 
 
 def _train(
-    config: TrainConfig, folder: Path, resume: bool, network_seconds: float, report: Reporter | None
+    config: TrainConfig,
+    folder: Path,
+    resume: bool,
+    network_seconds: float,
+    device: torch.device,
+    report: Reporter | None,
 ) -> None:
     """Train in one worker, from the capture to the last checkpoint."""
     torch.manual_seed(config.seed)
     run, capture = Run(folder), capture_of(config).with_cameras(config.cameras)
     if resume:
-        avatar, _, _ = load_checkpoint(run)
+        avatar, _, _ = load_checkpoint(run, device)
     else:
-        avatar = Avatar.from_capture(capture, capture.body, config.atlas, config.model)
-    lpips = load_lpips("alex") if config.loss.lpips else None
+        avatar = Avatar.from_capture(capture, capture.body, config.atlas, config.model).to(device)
+    lpips = load_lpips("alex").to(device) if config.loss.lpips else None
     clips = training_clips(capture)
     signals = {name: avatar.driving_signal(capture.motions[name]) for name in clips}
     still = rest_frames(capture, signals, clips, avatar.fps)
@@ -112,7 +133,7 @@ def _train(
         read_checkpoint(run, state)
     schedule = config.schedule if state.registered.clips else without_pretraining(config.schedule)
     limit = TimeLimit(schedule, state.seconds, workers.mean(network_seconds))
-    clock, stop = Clock(), False
+    clock, stop, dressed = Clock(), False, False
     monitor = Monitor(run.metrics, schedule.steps, report, began=state.progress)
     with stop_signals() as received:
         while state.progress < 1:
@@ -128,13 +149,16 @@ def _train(
                 if state.registered.complete:
                     settle_layers()
                 continue
-            if schedule_state.stage != "template" and avatar.texel_hidden.any():
-                settle_layers()
-            if schedule_state.stage != "template" and avatar.prior is not None and not avatar.prior.placed:
-                fit_prior(avatar, state.registered, signals, still, config.seed)
-                signals = {name: avatar.with_cloth(signal) for name, signal in signals.items()}
-                avatar.fit_input_statistics(list(signals.values()))
-                trainer.drive(signals)
+            if schedule_state.stage != "template" and not dressed:
+                if avatar.texel_hidden.any():
+                    settle_layers()
+                if avatar.prior is not None and not avatar.prior.placed:
+                    fit_prior(avatar, state.registered, signals, still, config.seed)
+                    signals = {name: avatar.with_cloth(signal) for name, signal in signals.items()}
+                    avatar.fit_input_statistics(list(signals.values()))
+                    trainer.drive(signals)
+                # Asked once, for the answers make the host wait for a GPU.
+                dressed = True
             set_rates(state.optimizers, schedule_state)
             rng = np.random.default_rng([config.seed, workers.rank(), state.step])
             gradients.clear()

@@ -5,6 +5,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from dsar.config import LossConfig
+from dsar.devices import takes_kernels
 from dsar.metrics.images import ssim
 from dsar.training.fused_loss import fused_image_loss
 from dsar.training.targets import Target
@@ -56,8 +57,8 @@ def image_loss(
     L_rgb is taken over a pyramid, and the difference of alpha and mask is added.
     """
     truth = target.color + (1 - target.alpha[..., None]) * background
-    on_cpu = truth.dtype == torch.float32 and truth.device.type == "cpu"
-    compare = fused_image_loss if on_cpu else plain_image_loss
+    fused = truth.dtype == torch.float32 and takes_kernels(truth)
+    compare = fused_image_loss if fused else plain_image_loss
     weights = (config.l1, config.ssim, config.alpha)
     loss = compare(output.color, output.alpha, truth, target.alpha, config.pyramid, weights)
     if lpips is not None:

@@ -5,6 +5,7 @@ takes the one that goes there, too. One that is far from usual cloth has to expl
 explain a few motions and fail on others.
 """
 
+import copy
 import dataclasses
 import logging
 from collections.abc import Mapping, Sequence
@@ -90,15 +91,20 @@ class _Fit:
         signals: Mapping[str, DrivingSignal],
         rest_frames: Sequence[tuple[str, int]],
     ) -> None:
-        self.garment, self.fps = garment, avatar.fps
+        # The search is in main memory, where the solver works.
+        self.fitted, self.garment, self.fps = garment, copy.deepcopy(garment).cpu(), avatar.fps
         self.simulation: ClothSimulation = garment.simulation(avatar.body)
         # One pose of each of a few sequences: cloth hangs a little differently in each.
         still = dict(reversed([(name, frame) for name, frame in rest_frames]))
         self.rest = [
-            self.simulation.stage(signals[name].steady[[frame]]) for name, frame in list(still.items())[:4]
+            self.simulation.stage(signals[name].steady[frame : frame + 1].cpu())
+            for name, frame in list(still.items())[:4]
         ]
         self.clips = [
-            _Clip(self.simulation.stage(signals[name].steady[fitted]), maps.offsets[name][fitted][:, points])
+            _Clip(
+                self.simulation.stage(signals[name].steady[fitted].cpu()),
+                maps.offsets[name][fitted][:, points].cpu(),
+            )
             for name, clip in sorted(maps.clips.items())
             if (count := int(maps.fitted[name])) > 1
             for fitted in (slice(clip.start, clip.start + count),)
@@ -115,10 +121,12 @@ class _Fit:
                 search.tell(tried, self._losses(tried))
             found = [np.zeros(len(best.to_vector())), search.result.xbest, search.result.xfavorite]
             best = constants_at(found[int(np.argmin(self._losses(found)))])
-        self.garment.constants.copy_(torch.from_numpy(best.to_vector()))
-        offsets, self.garment.hanging[:] = self._simulate(best)
-        self.garment.trust.copy_(self._trust(offsets))
-        LOGGER.info("The garment's cloth: %s; trust %s", best, self.garment.trust.numpy().round(2))
+        offsets, hanging = self._simulate(best)
+        trust = self._trust(offsets)
+        self.fitted.constants.copy_(torch.from_numpy(best.to_vector()))
+        self.fitted.hanging.copy_(hanging)
+        self.fitted.trust.copy_(trust)
+        LOGGER.info("The garment's cloth: %s; trust %s", best, trust.numpy().round(2))
 
     def _losses(self, tried: Sequence[np.ndarray]) -> list[float]:
         """Return the loss of each of some constants; each worker computes its share."""

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from dsar.avatar.avatar import Avatar
 from dsar.config import TrainConfig
+from dsar.devices import send
 from dsar.training import workers
 from dsar.training.rollouts import RolloutCursor
 from dsar.types import Capture
@@ -16,21 +17,30 @@ from dsar.types import Capture
 class RegisteredMaps:
     """A map for each frame of each sequence, as far as they are fitted, and what fitting them took."""
 
-    def __init__(self, clips: Mapping[str, range], points: int, unseen: Mapping[str, frozenset[int]]) -> None:
+    def __init__(
+        self,
+        clips: Mapping[str, range],
+        points: int,
+        unseen: Mapping[str, frozenset[int]],
+        device: torch.device | None = None,
+    ) -> None:
         """Begin with no map.
 
         Args:
             clips: Frames to register, by sequence; none where nothing is to be registered.
             points: Number of control points.
             unseen: Frames that no camera saw: their maps carry the cloth on and teach nothing.
+            device: Where the maps are; None: in main memory.
         """
-        self.clips, self.unseen = dict(clips), unseen
+        self.clips, self.unseen, self.device = dict(clips), unseen, device or torch.device("cpu")
         self.shares = divide_sequences(clips, workers.world_size())
         """Sequences that each worker fits."""
-        self.offsets = {name: torch.zeros(clip.stop, points, 3) for name, clip in clips.items()}
+        self.offsets = {
+            name: torch.zeros(clip.stop, points, 3, device=self.device) for name, clip in clips.items()
+        }
         """Offsets of the control points along their axes, metres, by frame."""
         self.fitted = {name: torch.zeros((), dtype=torch.int64) for name in clips}
-        """Frames of each clip that have a map, counted from its first."""
+        """Frames of each clip that have a map, counted from its first; in main memory."""
         self.count = 0
         """Frames fitted by the busiest worker."""
 
@@ -45,7 +55,7 @@ class RegisteredMaps:
             name: frozenset(frame for frame in clip if not capture.cameras_with_image(name, frame))
             for name, clip in registered.items()
         }
-        return cls(registered, len(avatar.control.cells), unseen)
+        return cls(registered, len(avatar.control.cells), unseen, avatar.device)
 
     @property
     def longest(self) -> int:
@@ -85,10 +95,10 @@ class RegisteredMaps:
         has_map = [self.has_map(cursor.sequence, cursor.frame) for cursor in cursors]
         points = next(iter(self.offsets.values())).shape[1:]
         maps = [
-            self.offsets[cursor.sequence][cursor.frame] if has else torch.zeros(points)
+            self.offsets[cursor.sequence][cursor.frame] if has else torch.zeros(points, device=self.device)
             for has, cursor in zip(has_map, cursors, strict=True)
         ]
-        return torch.stack(maps), torch.tensor(has_map)
+        return torch.stack(maps), send(torch.tensor(has_map), self.device)
 
     def all_gather(self) -> None:
         """Give all workers what each has fitted; it ends registration."""
@@ -107,7 +117,7 @@ class RegisteredMaps:
         Raises:
             KeyError: a sequence is missing.
         """
-        self.offsets = {name: tensors[f"offsets.{name}"] for name in self.offsets}
+        self.offsets = {name: tensors[f"offsets.{name}"].to(self.device) for name in self.offsets}
         self.fitted = {name: tensors[f"fitted.{name}"] for name in self.fitted}
         self.count = int(tensors["count"])
 

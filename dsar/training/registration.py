@@ -18,6 +18,7 @@ from dsar.avatar.avatar import Avatar
 from dsar.avatar.driving import DrivingSignal
 from dsar.body.skinning import blend_transforms
 from dsar.config import TrainConfig
+from dsar.devices import send
 from dsar.geometry.cameras import project
 from dsar.raster import rasterize, reduced_dilation
 from dsar.training import workers
@@ -91,9 +92,9 @@ class Registration:
     def fit(self, name: str, frame: int) -> UpdateMetrics | None:
         """Fit the map of a frame; those before it are fitted. Cloth that no camera saw stays as it was."""
         rng = np.random.default_rng([self.seed, self.order.index(name), frame])
-        motion_window = self.signals[name].windows[[frame]]
+        motion_window = self.signals[name].windows[frame : frame + 1]
         guesses, fast = self._guesses(motion_window, name, frame)
-        points = self._posed(motion_window, guesses[0])
+        points = self._posed(motion_window, guesses[0]).cpu()
         view = functools.cache(functools.partial(self._view, name, frame, points=points))
         cameras = self.capture.cameras_with_image(name, frame)
         if not cameras:
@@ -109,7 +110,7 @@ class Registration:
         guess = self._best(motion_window, guesses, draw_views())
         offset = guess.clone().requires_grad_()
         optimizer = torch.optim.Adam([offset], FAST_RATE if fast else RATE, betas=(0.8, 0.9))
-        loss, mse = torch.zeros(()), torch.zeros(())
+        loss, mse = offset.new_zeros(()), offset.new_zeros(())
         for _ in range(STEPS):
             optimizer.zero_grad()
             loss, mse = self._compare(motion_window, offset, draw_views(), rng.random(3))
@@ -118,7 +119,7 @@ class Registration:
             optimizer.step()
         self.maps.offsets[name][frame, self.garment] = offset.detach()
         self.maps.fitted[name] += 1
-        return UpdateMetrics(float(loss.detach()), float(mse))
+        return UpdateMetrics(*torch.stack([loss.detach(), mse]).tolist())
 
     @torch.no_grad()
     def _best(
@@ -153,7 +154,9 @@ class Registration:
         """Return the offsets of cloth that moves on through the world as it did before this frame."""
         avatar, garment, signal = self.avatar, self.garment, self.signals[name]
         past = self.maps.offsets[name]
-        newest, older = (self._posed(signal.windows[[f]], past[f, garment]) for f in (frame - 1, frame - 2))
+        newest, older = (
+            self._posed(signal.windows[f : f + 1], past[f, garment]) for f in (frame - 1, frame - 2)
+        )
         moved = newest + self._smooth(newest - older)
         blended = blend_transforms(avatar.control.weights[garment], motion_window[:, :1])[0, 0]
         points = torch.linalg.solve(blended[..., :3], (moved - blended[..., 3])[..., None])[..., 0]
@@ -168,8 +171,8 @@ class Registration:
     ) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
         """Return loss and squared error of views over a background, and how far neighbours part."""
         gaussians = self.avatar.gaussians(motion_window, self.avatar.offset_garment(offset[None]))[0]
-        color = torch.from_numpy(background.astype(np.float32))
-        loss, mse = torch.zeros(()), torch.zeros(())
+        color = send(torch.from_numpy(background.astype(np.float32)), offset.device)
+        loss, mse = offset.new_zeros(()), offset.new_zeros(())
         for target, weight in views:
             output = rasterize(
                 gaussians, target.camera, background=color, dilation=reduced_dilation(REDUCTION)
@@ -182,7 +185,10 @@ class Registration:
         return spatial_loss(self.avatar.scatter_garment_points(offset[None]), self.avatar.control.edges)
 
     def _view(self, name: str, frame: int, camera: int, points: Float[Tensor, "g 3"]) -> tuple[Target, float]:
-        """Return a view of the garment around its points in the world, and its share of the person's view."""
+        """Return a view of the garment, and its share of the person's view.
+
+        Around the garment's `points` in the world, which are in main memory: so nothing waits for a GPU.
+        """
         target = load_target(self.views, name, frame, camera, REDUCTION)
         pixels = project(target.camera, points)[0]
         height, width = target.alpha.shape
@@ -191,7 +197,7 @@ class Registration:
         x1, y1 = min(max(int(high[0]), x0 + 1), width), min(max(int(high[1]), y0 + 1), height)
         color, alpha = target.color[y0:y1, x0:x1].contiguous(), target.alpha[y0:y1, x0:x1].contiguous()
         part = Target(color, alpha, target.camera.cropped(x0, y0, x1 - x0, y1 - y0))
-        return part, alpha.numel() / target.alpha.numel()
+        return part.to(self.avatar.device), alpha.numel() / target.alpha.numel()
 
     def _posed(self, motion_window: Tensor, offset: Float[Tensor, "g 3"]) -> Float[Tensor, "g 3"]:
         """Return where the garment's control points are in the world."""
@@ -201,8 +207,8 @@ class Registration:
     def _smooth(self, vectors: Float[Tensor, "g 3"]) -> Float[Tensor, "g 3"]:
         """Return the mean of each control point of the garment and its neighbours."""
         avatar = self.avatar
-        spread = torch.zeros(len(avatar.control.cells), 4)
-        spread[self.garment] = torch.cat([vectors, torch.ones(len(vectors), 1)], 1)
+        spread = vectors.new_zeros(len(avatar.control.cells), 4)
+        spread[self.garment] = torch.cat([vectors, vectors.new_ones(len(vectors), 1)], 1)
         total = spread.clone()
         for a, b in (avatar.control.edges.T, avatar.control.edges.T.flip(0)):
             total.index_add_(0, a, spread[b])

@@ -26,7 +26,8 @@ class RestOffsets(nn.Module):
         super().__init__()
         self.frames = frames
         """Sequence and frame of each shape."""
-        self.offsets = nn.Parameter(torch.zeros(len(frames), len(avatar.garment_control_points()), 3))
+        shape = len(frames), len(avatar.garment_control_points()), 3
+        self.offsets = nn.Parameter(avatar.texel_positions.new_zeros(shape))
         """Offsets of the garment's control points along their axes, metres."""
         self._garment = avatar.garment_texels()
         self._chart = avatar.texel_positions[self._garment]
@@ -35,7 +36,7 @@ class RestOffsets(nn.Module):
 
     def output(self, avatar: Avatar, index: int) -> NetworkOutput:
         """Return the output that gives the garment the shape it has in one of the frames."""
-        return avatar.offset_garment(self.offsets[[index]])
+        return avatar.offset_garment(self.offsets[index : index + 1])
 
     def earliest(self, sequence: str) -> Float[Tensor, "g 3"]:
         """Return the offsets in the earliest still frame of a sequence, zeros if it has none."""

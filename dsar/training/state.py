@@ -124,6 +124,9 @@ class TrainingState:
         elif part in self.optimizers:
             _load_moments(self.optimizers[part], tensors)
         elif part == "rollouts":
+            prefix, device = "cursors.", self.avatar.device
+            cursors = {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
+            tensors = {k: v.to(device) for k, v in tensors.items() if not k.startswith(prefix)}
             self.network = NetworkState(
                 fresh=tensors["fresh"],
                 window=tuple(tensors[f"window.{i}"] for i in range(len(self.network.window))),
@@ -132,8 +135,6 @@ class TrainingState:
                 memory=tensors["memory"],
             )
             self.history.load_state_dict(tensors)
-            prefix = "cursors."
-            cursors = {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
             self.rollouts.load_state_dict(cursors)
         elif part == "registration":
             self.registered.load_state_dict(tensors)

@@ -103,7 +103,8 @@ def _part(tensors: dict[str, Tensor], part: str) -> dict[str, Tensor]:
 def _write_part(path: Path, tensors: dict[str, Tensor]) -> None:
     # Some tensors are one (the newest offset is state and record); the file format wants each by itself.
     copies = {
-        name: tensor.detach().clone(memory_format=torch.contiguous_format) for name, tensor in tensors.items()
+        name: tensor.detach().to("cpu", copy=True, memory_format=torch.contiguous_format)
+        for name, tensor in tensors.items()
     }
     save_file(copies, path)
 

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from dsar.avatar.input_maps import REFERENCE_FPS
 from dsar.config import LossConfig
+from dsar.devices import send
 from dsar.network import NetworkOutput
 from dsar.training.losses import CENTIMETRES
 
@@ -177,4 +178,4 @@ def squared_acceleration(
 
 def _have_seen(ages: list[int], past: int, like: Tensor) -> Float[Tensor, " b"]:
     """Return 1 for rollouts that have seen the frame so many before the newest, 0 for others."""
-    return like.new_tensor([float(age >= past) for age in ages])
+    return send(torch.tensor([float(age >= past) for age in ages], dtype=like.dtype), like.device)

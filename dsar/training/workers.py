@@ -32,7 +32,7 @@ class Gradients:
     """One flat buffer that holds all gradients of a list of parameters, summed over workers at once."""
 
     def __init__(self, parameters: list[nn.Parameter]) -> None:
-        self.buffer = torch.zeros(sum(p.numel() for p in parameters) + EXTRA_NUMBERS)
+        self.buffer = parameters[0].new_zeros(sum(p.numel() for p in parameters) + EXTRA_NUMBERS)
         offset = 0
         for parameter in parameters:
             view = self.buffer[offset : offset + parameter.numel()]
@@ -48,14 +48,14 @@ class Gradients:
 
         Only the first worker's clock counts, so that all see the same number.
         """
+        if not dist.is_initialized():
+            return stop, seconds
         self.buffer[-2] = float(stop)
         self.buffer[-1] = seconds if rank() == 0 else 0.0
-        if dist.is_initialized():
-            dist.all_reduce(self.buffer)
-        stopped, shared = bool(self.buffer[-2] > 0), float(self.buffer[-1])
-        if dist.is_initialized():
-            self.buffer /= world_size()
-        return stopped, shared
+        all_reduce([self.buffer])
+        stopped, shared = self.buffer[-EXTRA_NUMBERS:].tolist()
+        self.buffer /= world_size()
+        return stopped > 0, shared
 
 
 def rank() -> int:
@@ -87,10 +87,14 @@ def mean(value: float) -> float:
 
 
 def all_reduce(tensors: Iterable[Tensor]) -> None:
-    """Replace each tensor by its sum over workers."""
+    """Replace each tensor, wherever it is, by its sum over workers."""
     if dist.is_initialized():
         for tensor in tensors:
-            dist.all_reduce(tensor)
+            # Gloo adds in main memory.
+            shared = tensor.cpu()
+            dist.all_reduce(shared)
+            if shared is not tensor:
+                tensor.copy_(shared)
 
 
 def run_workers(count: int, work: Callable[..., None], arguments: tuple[Any, ...], report: Any) -> None:

@@ -295,7 +295,7 @@ def test_mistakes_are_one_line_and_exit_two(trained, tmp_path, capsys):
     assert "nowhere.npz" in failure(capsys, "export", trained, "--ply", tmp_path, "--motion", "nowhere.npz")
     assert "1001-1010" in failure(capsys, "export", trained, "--ply", tmp_path, "--frames", "2000")
     assert "checkpoint" in failure(capsys, "export", tmp_path, "--ply", tmp_path)
-    assert "cpu" in failure(capsys, "eval", trained, "--device", "cuda").lower()
+    assert "cuda:N" in failure(capsys, "eval", trained, "--device", "tpu")
     assert not list(tmp_path.iterdir())
 
 

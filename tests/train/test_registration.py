@@ -230,7 +230,9 @@ def test_workers_whose_clocks_differ_agree_on_the_time_that_registration_took(be
             return stop, 5.0 + registration.maps.count
 
     limit = TimeLimit(TrainConfig().schedule, used=2.0)
-    assert not loop._register(registration, Shared([]), [], Late(), limit, 0.12, lambda *_: None)
+    assert not loop._register(
+        registration, Shared([torch.nn.Parameter(torch.zeros(1))]), [], Late(), limit, 0.12, lambda *_: None
+    )
     assert limit.seconds == 2.0 + 8.0
 
 
@@ -245,6 +247,14 @@ def test_frames_that_time_was_too_short_for_are_counted():
         def average(self, stop, seconds):
             return stop, 25.0 + registration.maps.count
 
-    assert not loop._register(registration, Slow([]), [], loop.Clock(), limit, 0.12, lambda *_: None)
+    assert not loop._register(
+        registration,
+        Slow([torch.nn.Parameter(torch.zeros(1))]),
+        [],
+        loop.Clock(),
+        limit,
+        0.12,
+        lambda *_: None,
+    )
     assert registration.maps.complete
     assert registration.maps.unregistered == 3

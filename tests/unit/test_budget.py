@@ -47,13 +47,13 @@ def test_activations_are_those_that_a_real_step_keeps(wiring):
 
 
 def test_the_papers_preset_is_refused_where_it_does_not_fit(monkeypatch):
-    monkeypatch.setattr(budget, "available_memory", lambda: 24 * 2**30)
+    monkeypatch.setattr(budget, "available_memory", lambda *_: 24 * 2**30)
     with pytest.raises(
         ConfigError, match=r"about \d+\.\d GiB, 24\.0 GiB are free; .*--schedule.chunk-frames"
     ):
         budget.check_budget(PRESETS["paper"], 2)
-    monkeypatch.setattr(budget, "available_memory", lambda: 2**40)
-    monkeypatch.setattr(budget, "measure_flops", lambda: 1e11)
+    monkeypatch.setattr(budget, "available_memory", lambda *_: 2**40)
+    monkeypatch.setattr(budget, "measure_flops", lambda *_: 1e11)
     with pytest.raises(ConfigError, match=r"would take \d+ days or more.*--minutes"):
         budget.check_budget(PRESETS["paper"], 2)
     # What is left of a run that is all but done takes no time.

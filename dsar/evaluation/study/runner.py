@@ -11,6 +11,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from dsar.atomic_files import write_text_atomically
 from dsar.config import PRESETS, TrainConfig, absolute_capture, config_to_json
 from dsar.errors import ConfigError
@@ -67,6 +69,8 @@ class Study:
     """What the settings of a row start from."""
     cases: Mapping[str, Case] = field(default_factory=lambda: CASES)
     """The stability battery that every model runs."""
+    device: torch.device = field(default_factory=lambda: torch.device("cpu"))
+    """Where models are trained and measured."""
 
     def measurements(self, tables: Sequence[Table]) -> list[Measurement]:
         """Return what the tables need, first seeds first."""
@@ -116,7 +120,7 @@ class Study:
                 if hours is not None and now - began + update * left + _MEASURING > 3600 * hours:
                     return False
                 follow = partial(_follow, report, f"train {each.model.name}", done, len(needed))
-                train(config, run, resume=run.exists, report=follow)
+                train(config, run, resume=run.exists, report=follow, device=self.device)
                 update = (time.monotonic() - now) / max(left, 1)
             report(f"measure {each.model.name}", (done + 1) / len(needed))
             self._measure(each)
@@ -167,7 +171,7 @@ class Study:
 
     def _measure(self, each: Measurement) -> None:
         model, run = each.model, self._run(each.model)
-        avatar, config, provenance = load_checkpoint(run)
+        avatar, config, provenance = load_checkpoint(run, self.device)
         capture = open_images(run, config)
         streams: list[Stream] = [stream for stream in STREAMS if stream not in each.zeroed]
         content = {
@@ -178,7 +182,7 @@ class Study:
         }
         # The battery needs no more than one core and is over when `evaluate` comes to measure times.
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as other:
-            battery = None if each.zeroed else other.submit(_stress, run.folder, self.cases)
+            battery = None if each.zeroed else other.submit(_stress, run.folder, self.cases, self.device)
             content |= {
                 "updates": read_progress(run).step,
                 **evaluate(avatar, capture, streams=streams).to_json(),
@@ -188,10 +192,10 @@ class Study:
         write_text_atomically(self._figures(each), json.dumps(content, indent=1) + "\n")
 
 
-def _stress(folder: Path, cases: Mapping[str, Case]) -> dict[str, Any]:
+def _stress(folder: Path, cases: Mapping[str, Case], device: torch.device) -> dict[str, Any]:
     """Return the verdicts on a run, by case."""
     run = Run(folder)
-    avatar, config, _ = load_checkpoint(run)
+    avatar, config, _ = load_checkpoint(run, device)
     scene = open_scene(run, config)
     far = (scene.splits.get("fd") or scene.splits["test"])[0]
     return {name: verdict.to_json() for name, verdict in stress(avatar, scene.motions[far], cases)}
