@@ -25,9 +25,14 @@ _SHARED = tuple(
 
 
 def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a part of a kernel."""
+    """Compile a part of a kernel, which becomes part of its code wherever it is called.
+
+    Left as functions, parts are shared within a process: a kernel that was compiled in it calls those that
+    were optimised by themselves, the same kernel loaded from the disk those that were optimised with it. The
+    two round differently, and the first process on a machine would not repeat.
+    """
     # Unwrapped: checks that an import hook put around the function are not for the compiler.
-    return njit(**_OPTIONS)(inspect.unwrap(function))
+    return njit(forceinline=True, **_OPTIONS)(inspect.unwrap(function))
 
 
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
