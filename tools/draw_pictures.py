@@ -12,7 +12,7 @@ import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
-from dsar.geometry.paths import START_FRAME
+from dsar.geometry.camera_paths import START_FRAME
 from PIL import Image, ImageDraw, ImageFont
 
 from dsar import open_capture
