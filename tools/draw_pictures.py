@@ -12,10 +12,10 @@ import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
-from dsar.geometry.camera_paths import START_FRAME
 from PIL import Image, ImageDraw, ImageFont
 
 from dsar import open_capture
+from dsar.geometry.camera_paths import START_FRAME
 
 ROOT = Path(__file__).parents[1]
 IMAGES = ROOT / "docs" / "img"
