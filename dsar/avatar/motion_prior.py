@@ -83,6 +83,7 @@ class GarmentPrior(nn.Module):
 
     def place(self, positions: Float[Tensor, "n 3"], weights: Float[Tensor, "n j"]) -> None:
         """Set the rest shape and the skin weights from all texels of the chart, row by row."""
+        positions, weights = positions.cpu(), weights.cpu()  # once a run, for many small operations
         points = positions.unflatten(0, self.size)
         places = places_down(points, GRID[0])
         self.rest.copy_(fit_tube(points, places, GRID))

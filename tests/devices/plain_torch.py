@@ -4,14 +4,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from unittest.mock import patch
 
-from dsar.raster.reference import rasterize_reference
-
 
 @contextmanager
 def plain_torch() -> Iterator[None]:
     """Pose, rasterise and compare images in plain torch in a block, wherever tensors are."""
     with (
         patch("dsar.devices.KERNEL_DEVICES", frozenset()),
-        patch("dsar.raster.load_backend", lambda *_: rasterize_reference),
+        patch("dsar.raster.backends._choose_backend", lambda *_: "reference"),
     ):
         yield
