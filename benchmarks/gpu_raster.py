@@ -1,10 +1,12 @@
 """The GPU benchmark's rasterisers: how far from the float64 reference, and how fast."""
 
 import dataclasses
+import importlib
 import importlib.util
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
+from pathlib import Path
 
 import torch
 from gpu_memory import forget_peak, read_peak
@@ -22,6 +24,8 @@ MOST_APART = 0.002
 SAME_GRADIENT = 1e-3
 """Largest difference of a field's gradient, as a share of its norm."""
 MOST_RUNS = 200
+PACKED_KERNELS = Path(__file__).parents[1] / "kernels"
+"""Where tools/pack_gpu_benchmark.py puts Warp's kernels."""
 PASSES = ("forward", "forward_backward")
 
 
@@ -53,6 +57,7 @@ NEEDS: dict[str, tuple[str, str]] = {"warp": ("warp", "gpu"), "gsplat": ("gsplat
 def measure_parity(quick: bool, device: str, backends: Sequence[Backend] | None = None) -> Iterator[dict]:
     """Yield how far each backend is from the reference, by scene."""
     where, plan = choose_device(device), QUICK if quick else FULL
+    load_kernels(where)
     for name, (gaussians, camera, options) in make_scenes(*plan.parity).items():
         slow = render_with_gradients(gaussians, camera, "reference", torch.device("cpu"), options)
         for backend in backends or backends_of(where):
@@ -66,6 +71,19 @@ def measure_parity(quick: bool, device: str, backends: Sequence[Backend] | None 
 def backends_of(device: torch.device) -> tuple[Backend, ...]:
     """Return the backends for a device that need no compiler."""
     return ("warp", "reference") if device.type == "cuda" else ("cpu", "warp")
+
+
+def load_kernels(device: torch.device) -> bool:
+    """Have Warp take the kernels that travelled as PTX, if any did, which saves compiling them."""
+    folders = sorted(PACKED_KERNELS.glob("*")) if device.type == "cuda" else []
+    if not folders or find_obstacle("warp"):
+        return False
+    import warp as wp
+
+    for folder in folders:
+        module = importlib.import_module(f"dsar.raster.warp_backend.kernels_{folder.name}")
+        wp.load_aot_module(module, device=wp.device_from_torch(device), module_dir=folder, use_ptx=True)
+    return True
 
 
 def find_obstacle(backend: Backend) -> str | None:
@@ -125,6 +143,7 @@ def compare(fast: tuple[dict, dict], slow: tuple[dict, dict]) -> dict:
 def measure_raster(quick: bool, device: str, backends: Sequence[Backend] | None = None) -> Iterator[dict]:
     """Yield times by size, pass and backend, those of one size and pass taken in turn; then of batches."""
     where, plan = choose_device(device), QUICK if quick else FULL
+    load_kernels(where)
     chosen = backends or tuple(name for name in backends_of(where) if name != "reference")
     for backend in chosen:
         if obstacle := find_obstacle(backend):
