@@ -26,6 +26,8 @@ def describe_row(section: str, row: dict) -> str:
         text += f", {row['peak_bytes'] / 2**30:.2f} GiB"
     if "parts_ms" in row:
         text += "; " + ", ".join(f"{name} {ms:.3f}" for name, ms in row["parts_ms"].items())
+    if "kernels" in row:
+        text += f"kernels {row['kernels']}"
     if "gpu" in row:
         text += f"{row['gpu']}, {row['architecture']}, CUDA {row['cuda']}"
     return text
