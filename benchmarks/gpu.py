@@ -3,7 +3,8 @@
     python benchmarks/gpu.py [--quick] [--json FILE] [--chart DIR] [--device auto|cpu|cuda|cuda:N]
 
 Every section runs in a process of its own, so that one that fails spoils no other; the file is written anew
-after every row, so that a run which is cut keeps what it has. gsplat comes last: its first image compiles it.
+after every row, so that a run which is cut keeps what it has. gsplat comes last, because its first image
+compiles it for minutes; where Warp is not installed it comes before whole frames, which it then draws.
 `python tools/pack_gpu_benchmark.py DIR` collects what the run needs on a machine without a network.
 Nothing here compares with figures of another machine; the CPU's updates are measured on this one, too.
 """
@@ -24,7 +25,7 @@ from pathlib import Path
 import torch
 from gpu_frame import measure_frame
 from gpu_network import measure_network
-from gpu_raster import measure_gsplat, measure_parity, measure_raster
+from gpu_raster import find_obstacle, measure_gsplat, measure_parity, measure_raster
 from gpu_report import describe_row, find_ratios
 from gpu_training import measure_cpu_training, measure_training
 from isolated import SectionError, stream_isolated
@@ -72,6 +73,13 @@ SECTIONS = {
 }
 
 
+def order_sections() -> list[str]:
+    """Return the sections in their order; without Warp, gsplat is compiled before it draws whole frames."""
+    names = [name for name in SECTIONS if name != "gsplat"]
+    place = len(names) if find_obstacle("warp") is None else names.index("frame")
+    return [*names[:place], "gsplat", *names[place:]]
+
+
 def run_section(section: Section, quick: bool, device: str, seconds: float) -> Iterator[tuple[str, dict]]:
     """Yield `rows` with each row, and last `reason` where the section did not end well."""
     if seconds <= 0:
@@ -87,8 +95,8 @@ def run_section(section: Section, quick: bool, device: str, seconds: float) -> I
 def run(quick: bool, device: str, found: dict, keep: Callable[[], None]) -> None:
     """Run all sections, adding to what was found; `keep` is called whenever there is more."""
     began = time.monotonic()
-    for name, section in SECTIONS.items():
-        start = time.monotonic()
+    for name in order_sections():
+        section, start = SECTIONS[name], time.monotonic()
         entry: dict = {"rows": [], "failed": None}
         found["sections"][name] = entry
         for kind, value in run_section(section, quick, device, WHOLE_SECONDS - (start - began)):
