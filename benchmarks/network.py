@@ -107,13 +107,13 @@ def build(case: Case, design: str, device: str) -> Subject:
     network = avatar.to(device).network
     signal = avatar.driving_signal(motion)
     torch.nn.init.normal_(network.decoder.head.weight, std=0.01)
-    drawn = _draw(config, case, avatar.control.size, device)
+    drawn = draw_maps(config, case, avatar.control.size, device)
     if design == LITERAL:
         reference = ReferenceNetwork(network, doubling_kernels(network))
-        rollout, training = ReferenceRollout(reference), partial(_train_reference, reference, *drawn)
+        rollout, training = ReferenceRollout(reference), partial(train_reference, reference, *drawn)
     else:
         rollout = InferenceSession(network, precision=torch.bfloat16 if device == "cuda" else None)
-        network, training = rollout.network, partial(_train, network, *drawn)
+        network, training = rollout.network, partial(train, network, *drawn)
     maps, magnitude = (x[-1, :1] for x in drawn)
 
     @torch.no_grad()
@@ -132,7 +132,7 @@ def build(case: Case, design: str, device: str) -> Subject:
     return Subject(network, step, frame, training)
 
 
-def _draw(
+def draw_maps(
     config: ModelConfig, case: Case, size: tuple[int, int], device: str
 ) -> tuple[Float[Tensor, "n b c h w"], Float[Tensor, "n b 1 h w"]]:
     """Return random input maps and magnitudes of a window."""
@@ -141,7 +141,7 @@ def _draw(
     return maps, torch.rand(*shape, 1, *size, device=device)
 
 
-def _train(network: DualStreamNetwork, maps: Tensor, magnitudes: Tensor) -> None:
+def train(network: DualStreamNetwork, maps: Tensor, magnitudes: Tensor) -> None:
     """Back-propagate one step, from a state that was carried on."""
     state = network.initial_state(maps.shape[1])
     state = dataclasses.replace(state, fresh=torch.zeros_like(state.fresh))
@@ -149,7 +149,8 @@ def _train(network: DualStreamNetwork, maps: Tensor, magnitudes: Tensor) -> None
     _backward(network, output)
 
 
-def _train_reference(reference: ReferenceNetwork, maps: Tensor, magnitudes: Tensor) -> None:
+def train_reference(reference: ReferenceNetwork, maps: Tensor, magnitudes: Tensor) -> None:
+    """Back-propagate one step of the literal design."""
     state = reference.network.initial_state(maps.shape[1])
     frames = (maps.transpose(0, 1), magnitudes.transpose(0, 1))
     output, _ = reference(*frames, state.offsets[:, -1], state.memory)
