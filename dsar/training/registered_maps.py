@@ -121,7 +121,7 @@ class RegisteredMaps:
         Raises:
             KeyError: a sequence is missing.
         """
-        self.offsets = {name: tensors[f"offsets.{name}"].to(self.device) for name in self.offsets}
+        self.offsets = {name: tensors[f"offsets.{name}"].to(self.device, copy=True) for name in self.offsets}
         self.fitted = {name: tensors[f"fitted.{name}"].clone() for name in self.fitted}
         left = {
             name: range(clip.start + int(self.fitted[name]), clip.stop) for name, clip in self.clips.items()
