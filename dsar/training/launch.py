@@ -164,12 +164,12 @@ def takes_the_word() -> bool:
 
 
 @functools.cache
-def _store() -> dist.Store:
+def _store() -> dist.Store:  # pyright: ignore[reportPrivateImportUsage]
     launch = launched()
     assert launch is not None
     ranks = launch.rank, launch.world_size
     store, _, _ = next(dist.rendezvous("env://", *ranks, timeout=timedelta(minutes=5)))  # pyright: ignore
-    return dist.PrefixStore("dsar", store)
+    return dist.PrefixStore("dsar", store)  # pyright: ignore[reportPrivateImportUsage]
 
 
 @contextmanager
