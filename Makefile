@@ -14,7 +14,7 @@ demo: $(STAMP)
 
 # Two files of tests at a time, the slow ones (tests/train) before the quick.
 test: $(STAMP)
-	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder
+	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder --durations 25
 
 # Blender, a splat converter and a web viewer of others, in which our files are tried; about 1.3 GB.
 interop: $(STAMP)

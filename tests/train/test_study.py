@@ -1,10 +1,12 @@
 """The study: every row is a model that can be built; what is done is not done again; tables say what is."""
 
+import dataclasses
 import json
 
 import pytest
 
 from dsar.atomic_files import write_text_atomically
+from dsar.config import PRESETS
 from dsar.errors import ConfigError
 from dsar.evaluation.report import write_report
 from dsar.evaluation.stress import run_causal
@@ -51,6 +53,21 @@ def test_a_row_that_names_no_setting_is_refused(tmp_path):
         study.config(runner.Model({"model.windows": 3}, 0))
 
 
+@pytest.fixture
+def tiny_preset(monkeypatch):
+    """Make the preset of the study one that trains in seconds."""
+    demo = PRESETS["demo"]
+    tiny = dataclasses.replace(
+        demo,
+        workers=1,
+        atlas=dataclasses.replace(demo.atlas, resolution=32, garment="off"),
+        model=dataclasses.replace(demo.model, channels=(8, 16), heads=2),
+        schedule=dataclasses.replace(demo.schedule, rollouts_per_worker=2),
+    )
+    monkeypatch.setitem(PRESETS, "demo", tiny)
+
+
+@pytest.mark.usefixtures("tiny_preset")
 def test_a_study_goes_on_with_what_is_missing_and_does_nothing_twice(tiny_capture, tmp_path):
     study = Study(tmp_path, 12, str(tiny_capture), cases={"causal": run_causal})
     tables = list(TINY.values())

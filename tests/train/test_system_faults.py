@@ -68,7 +68,7 @@ def arguments(command):
     elif command.startswith("crosscheck"):
         command += " --variant scalar_rgb"
     elif "--ablations" in command:
-        command += " --capture my_capture --minutes 0.05"
+        command += " --capture my_capture --steps 12"
     return [*shlex.split(command), "--progress", "none"]
 
 
