@@ -6,7 +6,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_stdout
 from typing import Annotated, NoReturn
 
 import tyro
@@ -76,9 +76,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     Exit codes: 2 where an input, a setting or the system is at fault, 1 where a part of a batch failed, 130
     where the command was interrupted, 143 where it was terminated.
     """
-    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
+    level = logging.INFO if _is_first_rank() else logging.ERROR
+    logging.basicConfig(level=level, format="%(message)s", stream=sys.stderr)
     try:
-        command = parse(sys.argv[1:] if arguments is None else arguments)
+        with nullcontext() if _is_first_rank() else _silent():
+            command = parse(sys.argv[1:] if arguments is None else arguments)
         with _cleaning_up_when_terminated():
             command.check_outputs_writable()
             _run(command)
@@ -111,6 +113,24 @@ def _run(command: Command) -> None:
 
 
 def _leave(message: str, code: int, cause: BaseException | None = None) -> NoReturn:
-    """Write one line and end with an exit code."""
-    sys.stderr.write(f"dsar: {' '.join(message.split())}\n")
+    """Write one line and end with an exit code; of ranks that end together one writes it."""
+    if "RANK" not in os.environ or _takes_the_word():
+        sys.stderr.write(f"dsar: {' '.join(message.split())}\n")
     raise SystemExit(code) from cause
+
+
+def _takes_the_word() -> bool:
+    from dsar.training.launch import takes_the_word
+
+    return takes_the_word()
+
+
+def _is_first_rank() -> bool:
+    """Return whether this process is one that speaks of what all ranks meet (`dsar.training.launch`)."""
+    return os.environ.get("RANK", "0") == "0"
+
+
+@contextmanager
+def _silent() -> Iterator[None]:
+    with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
+        yield

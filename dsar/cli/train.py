@@ -3,7 +3,7 @@
 import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import tyro
 
@@ -11,6 +11,12 @@ from dsar.cli.command import Common
 from dsar.cli.previews import write_previews
 from dsar.config import PRESETS, AtlasConfig, LossConfig, ModelConfig, ScheduleConfig, TrainConfig
 from dsar.console import ProgressBar
+from dsar.errors import ConfigError, TrainingError
+
+if TYPE_CHECKING:
+    import torch
+
+    from dsar.training.report import Report
 
 
 @dataclass(frozen=True)
@@ -37,7 +43,7 @@ class Train(Common):
     minutes: float | None = None
     """Limit on the time; where a machine is too slow for it, the schedule is compressed to fit."""
     workers: int | None = None
-    """Processes, one core each."""
+    """Processes, one core each; torchrun starts them itself, and says how many."""
     resume: bool = False
     """Go on with the run in --out."""
     seed: int = 0
@@ -67,12 +73,32 @@ class Train(Common):
             test_frames=self.test_frames,
             cameras=self.cameras,
             seed=self.seed,
-            workers=preset.workers if self.workers is None else self.workers,
+            workers=self._worker_count(preset.workers),
             atlas=self.atlas,
             model=self.model,
             loss=self.loss,
             schedule=schedule,
         )
+
+    def _worker_count(self, usual: int) -> int:
+        """Return how many processes train; a ConfigError where flag and torchrun disagree."""
+        from dsar.training.launch import launched
+
+        launch = launched()
+        if launch is None:
+            return usual if self.workers is None else self.workers
+        if self.workers not in (None, launch.world_size):
+            raise ConfigError(
+                f"--workers {self.workers}: torchrun started {launch.world_size}; leave --workers out"
+            )
+        return launch.world_size
+
+    def check_outputs_writable(self) -> None:
+        """Check it where it is written: alone, or in the first rank."""
+        from dsar.training.launch import is_first
+
+        if is_first():
+            super().check_outputs_writable()
 
     def output_folders(self) -> list[Path]:
         """Return the run's folder."""
@@ -94,19 +120,27 @@ class Train(Common):
         return f"training is saved up to update {step} in {run.checkpoint}; --resume goes on from there"
 
     def run(self) -> None:
-        """Train, then leave pictures and a report."""
-        from dsar.data.captures.formats import capture_of
-        from dsar.evaluation.check import refuse_unusable_images
-        from dsar.training.checkpoint import Run, read_progress
+        """Train, then leave pictures and a report; of several ranks only the first does that."""
+        from dsar.training import launch
+        from dsar.training.checkpoint import Run
+
+        device, config = launch.own_device(self.device), self.config()
+        with launch.joined(device):
+            if not launch.from_first(Run(self.folder).checkpoint.exists):
+                launch.from_first(lambda: _refuse_unusable_images(config))
+            last = self._train(config, device)
+        if launch.is_first():
+            self._show_results(last, device)
+
+    def _train(self, config: TrainConfig, device: "torch.device") -> "list[Report]":
+        """Train, and return the last report, where this process gets one."""
+        from dsar.training.checkpoint import Run
+        from dsar.training.launch import is_first, launched
         from dsar.training.loop import train
         from dsar.training.report import Report
 
-        device = self.chosen_device()
-        run, config = Run(self.folder), self.config()
-        if not run.checkpoint.exists():
-            refuse_unusable_images(capture_of(config).with_cameras(config.cameras))
         last: list[Report] = []
-        with ProgressBar(self.progress, "train").running() as bar:
+        with ProgressBar(self.progress if is_first() else "none", "train").running() as bar:
 
             def report(line: Report) -> None:
                 last[:] = [line]
@@ -114,7 +148,25 @@ class Train(Common):
                 numbers = f"loss {line.loss:.4f} PSNR {line.psnr:.2f} dB"
                 bar.show(line.progress, f"{line.stage} step {line.step} {numbers}{left}")
 
-            train(config, run, resume=self.resume, report=report, device=device)
+            try:
+                train(config, Run(self.folder), resume=self.resume, report=report, device=device)
+            except TrainingError as error:
+                if launched() is None:
+                    raise
+                raise TrainingError(f"{error}; {self.describe_remains()}") from error
+        return last
+
+    def _show_results(self, last: "list[Report]", device: "torch.device") -> None:
+        from dsar.training.checkpoint import Run, read_progress
+
+        run = Run(self.folder)
         sheet = write_previews(run.folder, device)
         reached = dataclasses.asdict(last[-1] if last else read_progress(run))
         self.write_json({"run": str(run.folder), "sheet": str(sheet), **reached})
+
+
+def _refuse_unusable_images(config: TrainConfig) -> None:
+    from dsar.data.captures.formats import capture_of
+    from dsar.evaluation.check import refuse_unusable_images
+
+    refuse_unusable_images(capture_of(config).with_cameras(config.cameras))

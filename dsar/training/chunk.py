@@ -19,6 +19,7 @@ from dsar.devices import send
 from dsar.errors import TrainingError
 from dsar.network import STREAMS, NetworkOutput, Stream
 from dsar.raster import rasterize, reduced_dilation
+from dsar.training import workers
 from dsar.training.driving_maps import DrivingFrames, DrivingMaps
 from dsar.training.kept_views import KeptViews
 from dsar.training.losses import CENTIMETRES, image_loss, registered_loss, spatial_loss
@@ -71,7 +72,8 @@ class ChunkTrainer:
         self.config, self.state, self.avatar = config, state, state.avatar
         self.lpips = lpips
         avatar, self.device = state.avatar, state.avatar.device
-        self.loader = TargetLoader(views, self.device, max(1, (os.cpu_count() or 1) // config.workers))
+        threads = max(1, (os.cpu_count() or 1) // workers.local_count(config.workers))
+        self.loader = TargetLoader(views, self.device, threads)
         self._shown = False
         self.mirror = Mirror(avatar.control) if config.schedule.mirrored_fraction else None
         self.drive(signals)

@@ -17,7 +17,7 @@ from dsar.config import TrainConfig, config_to_json, with_absolute_paths
 from dsar.data.captures.formats import capture_of
 from dsar.errors import CaptureError, CheckpointError, ConfigError, TrainingError
 from dsar.metrics.lpips import load_lpips
-from dsar.training import workers
+from dsar.training import launch, workers
 from dsar.training.budget import check_budget
 from dsar.training.checkpoint import Run, check_files, load_checkpoint, read_config, read_progress
 from dsar.training.chunk import ChunkTrainer
@@ -28,7 +28,13 @@ from dsar.training.pace import Clock, leave, stop_signals
 from dsar.training.prior_fitting import fit_prior
 from dsar.training.registration import Registration
 from dsar.training.report import REPORT_EVERY, Monitor, Reporter, UpdateMetrics, warn_if_cut_short
-from dsar.training.resuming import check_same_settings, resumed_settings, with_body, with_former_defaults
+from dsar.training.resuming import (
+    check_same_settings,
+    divide_anew,
+    resumed_settings,
+    with_body,
+    with_former_defaults,
+)
 from dsar.training.scene import scene_of_capture, write_scene
 from dsar.training.schedule import ScheduleState, schedule_at, without_pretraining
 from dsar.training.state import TrainingState
@@ -59,13 +65,31 @@ def train(
     Args:
         config: The settings of the run.
         run: Its folder.
-        resume: Whether to go on with it, on whatever device it was trained so far.
+        resume: Whether to go on with it, on whatever devices and by how many workers it was trained so far.
         report: Is told of progress.
         device: Where to compute.
+
+    Where torchrun started several ranks all call this: they are the workers, and the first one writes.
 
     Raises:
         DsarError: before any work, where settings, capture, body or run folder are not usable;
             TrainingError when a value stops being finite.
+    """
+    device = torch.device(device)
+    config = dataclasses.replace(config, workers=workers.total_count(config.workers))
+    with launch.joined(device):
+        divided, seconds = launch.from_first(partial(_prepare, config, run, device, resume=resume))
+        workers.run_workers(divided.workers, _train, (divided, run.folder, resume, seconds, device), report)
+    return run
+
+
+def _prepare(
+    config: TrainConfig, run: Run, device: torch.device, *, resume: bool
+) -> tuple[TrainConfig, float]:
+    """Check all that is asked for, and write down the settings and the scene of the run.
+
+    Returns:
+        The settings for the workers that there are, and the seconds that an update's network takes at least.
     """
     config.validate()
     if run.checkpoint.exists() and not resume:
@@ -88,15 +112,16 @@ def train(
         saved = resumed_settings(run, config, whole)
         config = with_former_defaults(config, saved)
         check_same_settings(config, saved, run)
+        config, divided = dataclasses.replace(config, workers=saved.workers), divide_anew(config, saved)
+    else:
+        divided = config
     done = read_progress(run).progress if resume else 0.0
     images = capture.kept_bytes + kept_bytes(capture)
-    device = torch.device(device)
-    budget = check_budget(config, workers.local_count(config.workers), done, images, device)
+    sharing = 1 if device.type == "cuda" and launch.launched() else workers.local_count(divided.workers)
+    budget = check_budget(divided, sharing, done, images, device)
     write_scene(run.scene, scene_of_capture(whole))
     write_text_atomically(run.config, config_to_json(config))
-    arguments = config, run.folder, resume, budget.seconds, device
-    workers.run_workers(config.workers, _train, arguments, report)
-    return run
+    return divided, budget.seconds
 
 
 def _train(

@@ -33,16 +33,13 @@ class RegisteredMaps:
             device: Where the maps are; None: in main memory.
         """
         self.clips, self.unseen, self.device = dict(clips), unseen, device or torch.device("cpu")
-        self.shares = divide_sequences(clips, workers.world_size())
-        """Sequences that each worker fits."""
         self.offsets = {
             name: torch.zeros(clip.stop, points, 3, device=self.device) for name, clip in clips.items()
         }
         """Offsets of the control points along their axes, metres, by frame."""
         self.fitted = {name: torch.zeros((), dtype=torch.int64) for name in clips}
         """Frames of each clip that have a map, counted from its first; in main memory."""
-        self.count = 0
-        """Frames fitted by the busiest worker."""
+        self._divide(self.clips)
 
     @classmethod
     def begin(
@@ -57,10 +54,17 @@ class RegisteredMaps:
         }
         return cls(registered, len(avatar.control.cells), unseen, avatar.device)
 
-    @property
-    def longest(self) -> int:
+    def _divide(self, frames: Mapping[str, range]) -> None:
+        """Divide frames without a map among the workers, by sequences: each map follows from the last."""
+        shares = divide_sequences(frames, workers.world_size())
+        self.share = frozenset(shares[workers.rank()])
+        """Sequences of which this worker has the maps, until all are fitted."""
+        self.own = [(name, frame) for name in shares[workers.rank()] for frame in frames[name]]
+        """Sequence and frame of what this worker fits, in that order."""
+        self.longest = max(sum(len(frames[name]) for name in share) for share in shares)
         """Frames that the busiest worker fits."""
-        return max(sum(len(self.clips[name]) for name in share) for share in self.shares)
+        self.count = 0
+        """Frames of these that it has fitted."""
 
     @property
     def frames_left(self) -> int:
@@ -109,17 +113,24 @@ class RegisteredMaps:
         """Return the maps, and how far fitting them has come."""
         tensors = {f"offsets.{name}": maps for name, maps in self.offsets.items()}
         tensors |= {f"fitted.{name}": fitted for name, fitted in self.fitted.items()}
-        return tensors | {"count": torch.tensor(self.count)}
+        return tensors | {"complete": torch.tensor(self.complete)}
 
     def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restore what `state_dict` returned.
+        """Restore what `state_dict` returned, of all workers (`merge_registration`); divide what is left.
 
         Raises:
             KeyError: a sequence is missing.
         """
-        self.offsets = {name: tensors[f"offsets.{name}"].to(self.device) for name in self.offsets}
-        self.fitted = {name: tensors[f"fitted.{name}"] for name in self.fitted}
-        self.count = int(tensors["count"])
+        self.offsets = {name: tensors[f"offsets.{name}"].to(self.device, copy=True) for name in self.offsets}
+        self.fitted = {name: tensors[f"fitted.{name}"].clone() for name in self.fitted}
+        left = {
+            name: range(clip.start + int(self.fitted[name]), clip.stop) for name, clip in self.clips.items()
+        }
+        self._divide({} if tensors["complete"] else left)
+        for name in self.clips.keys() - self.share if not self.complete else ():
+            # The sum over workers ends registration, and these are another's.
+            self.offsets[name].zero_()
+            self.fitted[name].zero_()
 
 
 def divide_sequences(clips: Mapping[str, range], workers: int) -> list[list[str]]:

@@ -21,7 +21,6 @@ from dsar.config import TrainConfig
 from dsar.devices import send
 from dsar.geometry.cameras import project
 from dsar.raster import rasterize, reduced_dilation
-from dsar.training import workers
 from dsar.training.kept_views import KeptViews
 from dsar.training.losses import image_loss, spatial_loss
 from dsar.training.registered_maps import RegisteredMaps
@@ -79,15 +78,13 @@ class Registration:
         self.rest, self.maps = rest, maps
         self.loss = dataclasses.replace(config.loss, **STRUCTURE)
         self.garment = avatar.garment_control_points()
-        own = maps.shares[workers.rank()]
-        self.frames = [(name, frame) for name in own for frame in maps.clips[name]]
         self.order = list(maps.clips)
 
     def fit_next(self) -> UpdateMetrics | None:
         """Fit this worker's next frame, if it has one left."""
         index = self.maps.count
         self.maps.count += 1
-        return self.fit(*self.frames[index]) if index < len(self.frames) else None
+        return self.fit(*self.maps.own[index]) if index < len(self.maps.own) else None
 
     def fit(self, name: str, frame: int) -> UpdateMetrics | None:
         """Fit the map of a frame; those before it are fitted. Cloth that no camera saw stays as it was."""

@@ -1,4 +1,4 @@
-"""The settings with which a run may go on: those it was begun with, but for its length and its places."""
+"""The settings with which a run may go on: its own, but for its length, its places and its workers."""
 
 import dataclasses
 import logging
@@ -45,7 +45,8 @@ def with_former_defaults(config: TrainConfig, saved: TrainConfig) -> TrainConfig
 
 
 def check_same_settings(config: TrainConfig, saved: TrainConfig, run: Run) -> None:
-    """Raise ConfigError where a resumed run would change a setting other than its length."""
+    """Raise ConfigError where a resumed run would change a setting other than its length and its workers."""
+    saved = dataclasses.replace(saved, workers=config.workers)
     length = {"steps": config.schedule.steps, "minutes": config.schedule.minutes}
     saved = dataclasses.replace(saved, schedule=dataclasses.replace(saved.schedule, **length))
     given, recorded = dataclasses.asdict(config), dataclasses.asdict(saved)
@@ -55,3 +56,27 @@ def check_same_settings(config: TrainConfig, saved: TrainConfig, run: Run) -> No
             f"--resume: {run.config} was made with other values of {', '.join(changed)}; repeat the command "
             "that started the run, or start another with a new --out"
         )
+
+
+def divide_anew(config: TrainConfig, saved: TrainConfig) -> TrainConfig:
+    """Return the settings with the rollouts that a run began with divided among today's workers.
+
+    Raises:
+        ConfigError: they cannot be divided evenly, and every rollout counts alike.
+    """
+    if config.workers == saved.workers:
+        return config
+    rollouts = saved.workers * saved.schedule.rollouts_per_worker
+    each, rest = divmod(rollouts, config.workers)
+    if rest:
+        fitting = ", ".join(str(count) for count in range(1, rollouts + 1) if rollouts % count == 0)
+        raise ConfigError(
+            f"--resume: the run has {rollouts} rollouts ({saved.workers} workers of "
+            f"{saved.schedule.rollouts_per_worker}), which {config.workers} workers cannot share evenly; "
+            f"resume with one of {fitting}"
+        )
+    _log.info(
+        "The run's %d rollouts are divided among %d workers now, %d each", rollouts, config.workers, each
+    )
+    schedule = dataclasses.replace(config.schedule, rollouts_per_worker=each)
+    return dataclasses.replace(config, schedule=schedule)

@@ -4,14 +4,14 @@ import json
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import torch
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor
 
 from dsar.atomic_files import naming_storage_errors
-from dsar.errors import CheckpointError
 from dsar.text import decode_text
 from dsar.training import workers
 from dsar.training.checkpoint import (
@@ -31,14 +31,15 @@ from dsar.training.migrations import (
     cursor_tensors,
     rename_tensors,
 )
+from dsar.training.redivision import merge_registration, take_rollouts
 from dsar.training.state import TrainingState
 
 _OWN = ("rollouts", "registration")
-"""Parts of the state that each worker keeps for itself."""
+"""Parts of the state that each worker has for itself, one file each."""
 
 
 def write_checkpoint(run: Run, state: TrainingState) -> None:
-    """Write a complete checkpoint, every worker its own rollouts, and put it in place at once.
+    """Write a complete checkpoint, and put it in place at once: the first worker does, with all that are.
 
     Raises:
         StorageError: the system does not take it; the checkpoint before it stays.
@@ -51,11 +52,13 @@ def write_checkpoint(run: Run, state: TrainingState) -> None:
             folder.mkdir()
             for part in ("avatar", *state.optimizers):
                 more = describe_avatar(state.avatar) if part == "avatar" else {}
-                _write_part(folder / f"{part}.safetensors", _part(tensors, part) | more)
-        workers.barrier()
+                (folder / f"{part}.safetensors").write_bytes(_content(_part(tensors, part) | more))
         for part in _OWN:
-            _write_part(folder / f"{part}-{rank}.safetensors", _part(tensors, part))
-        workers.barrier()
+            own = _content(_part(tensors, part))
+            if rank == 0:
+                (folder / f"{part}-0.safetensors").write_bytes(own)
+            for number, content in workers.collected(own):
+                (folder / f"{part}-{number}.safetensors").write_bytes(content)
         if rank == 0:
             write_progress(folder, _progress(state, run))
             replace_folder(folder, run.checkpoint)
@@ -65,23 +68,41 @@ def write_checkpoint(run: Run, state: TrainingState) -> None:
 def read_checkpoint(run: Run, state: TrainingState) -> None:
     """Restore a worker's state, whose avatar was made by `load_checkpoint` already.
 
+    Where another number of workers wrote it, rollouts and frames to register are divided anew.
+
     Raises:
-        CheckpointError: a file is damaged or foreign, or the run was trained by another number of workers.
+        CheckpointError: a file is damaged or foreign.
     """
-    at, folder, rank = read_progress(run), run.checkpoint, workers.rank()
-    if not (folder / f"rollouts-{rank}.safetensors").exists():
-        raise CheckpointError(f"{folder} has no state of worker {rank}; resume with the run's own --workers")
-    files = {part: folder / f"{part}.safetensors" for part in state.optimizers}
-    files |= {part: folder / f"{part}-{rank}.safetensors" for part in _OWN}
-    for part, path in files.items():
+    at, folder = read_progress(run), run.checkpoint
+    for part in state.optimizers:
+        path = folder / f"{part}.safetensors"
         with reading(path):
-            tensors = read_tensors(path)
-            if part == "rollouts":
-                tensors = rename_tensors(tensors, at.format_version, ROLLOUT_NAMES)
-                if at.format_version == OLDEST_VERSION:
-                    tensors |= _read_cursors(path.with_suffix(".json"))
-            state.load_state_dict({f"{part}.{name}": value for name, value in tensors.items()})
+            _load_part(state, part, read_tensors(path))
+    count, own = len(state.rollouts.cursors), workers.rank()
+    files = {
+        part: [folder / f"{part}-{number}.safetensors" for number in range(writers(run))] for part in _OWN
+    }
+    with reading(files["rollouts"][0]):
+        parts = [partial(_read_rollouts, path, at.format_version) for path in files["rollouts"]]
+        _load_part(state, "rollouts", take_rollouts(parts, range(own * count, (own + 1) * count)))
+    with reading(files["registration"][0]):
+        maps = [read_tensors(path) for path in files["registration"]]
+        _load_part(state, "registration", merge_registration(maps))
     state.step, state.progress, state.skipped, state.seconds = at.step, at.progress, at.skipped, at.seconds
+
+
+def writers(run: Run) -> int:
+    """Return how many workers wrote a checkpoint."""
+    return max(1, sum(1 for _ in run.checkpoint.glob("rollouts-*.safetensors")))
+
+
+def _load_part(state: TrainingState, part: str, tensors: dict[str, Tensor]) -> None:
+    state.load_state_dict({f"{part}.{name}": value for name, value in tensors.items()})
+
+
+def _read_rollouts(path: Path, version: int) -> dict[str, Tensor]:
+    tensors = rename_tensors(read_tensors(path), version, ROLLOUT_NAMES)
+    return tensors | (_read_cursors(path.with_suffix(".json")) if version == OLDEST_VERSION else {})
 
 
 def _progress(state: TrainingState, run: Run) -> CheckpointProgress:
@@ -100,13 +121,15 @@ def _part(tensors: dict[str, Tensor], part: str) -> dict[str, Tensor]:
     return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
 
 
-def _write_part(path: Path, tensors: dict[str, Tensor]) -> None:
+def _content(tensors: dict[str, Tensor]) -> bytes:
+    """Return what a file of tensors holds."""
     # Some tensors are one (the newest offset is state and record); the file format wants each by itself.
-    copies = {
-        name: tensor.detach().to("cpu", copy=True, memory_format=torch.contiguous_format)
-        for name, tensor in tensors.items()
-    }
-    save_file(copies, path)
+    return save(
+        {
+            name: tensor.detach().to("cpu", copy=True, memory_format=torch.contiguous_format)
+            for name, tensor in tensors.items()
+        }
+    )
 
 
 @contextmanager

@@ -1,6 +1,7 @@
 """Several processes that train as one: each renders its own rollouts, gradients are summed.
 
-Started by torchrun, the processes it made are used; otherwise the first process starts the others.
+Ranks that torchrun started (`dsar.training.launch`) are used as they are; otherwise the first process starts
+the others.
 Small tensors make intra-operation threads useless here, so every worker computes on one thread.
 """
 
@@ -20,6 +21,7 @@ import torch.distributed as dist
 from torch import Tensor, nn
 
 from dsar.errors import DsarError, TrainingError
+from dsar.training.launch import is_broken_group, launched, naming_lost_ranks
 
 EXTRA_NUMBERS = 2
 """Extra numbers that travel with the gradients: a request to stop, and the time that was taken."""
@@ -50,10 +52,16 @@ class Gradients:
         """
         if not dist.is_initialized():
             return stop, seconds
-        self.buffer[-2] = float(stop)
-        self.buffer[-1] = seconds if rank() == 0 else 0.0
+        extra = self.buffer[-EXTRA_NUMBERS:]
+        if _adds_on_gpu(self.buffer):
+            # Through main memory: a rank that is gone is noticed here, where NCCL would wait for it.
+            extra = torch.zeros(EXTRA_NUMBERS)
+        extra[0] = float(stop)
+        extra[1] = seconds if rank() == 0 else 0.0
+        if _adds_on_gpu(self.buffer):
+            all_reduce([extra])
         all_reduce([self.buffer])
-        stopped, shared = self.buffer[-EXTRA_NUMBERS:].tolist()
+        stopped, shared = extra.tolist()
         self.buffer /= world_size()
         return stopped > 0, shared
 
@@ -68,15 +76,37 @@ def world_size() -> int:
     return dist.get_world_size() if dist.is_initialized() else 1
 
 
-def local_count(requested: int) -> int:
-    """Return how many workers this machine will have: those that torchrun made, else as many as requested."""
-    return int(os.environ.get("LOCAL_WORLD_SIZE", requested))
+def total_count(requested: int) -> int:
+    """Return how many workers a run will have: the ranks that torchrun started, else as many as requested."""
+    launch = launched()
+    return requested if launch is None else launch.world_size
+
+
+def local_count(count: int) -> int:
+    """Return how many of so many workers are on this machine."""
+    launch = launched()
+    return count if launch is None else launch.local_world_size
 
 
 def barrier() -> None:
     """Wait for all workers."""
-    if dist.is_initialized():
-        dist.barrier()
+    all_reduce([torch.zeros(1)])
+
+
+def collected(content: bytes) -> Iterator[tuple[int, bytes]]:
+    """Yield in the first worker the number of each other one and what it gives; in those, nothing."""
+    if world_size() == 1:
+        return
+    sizes = torch.zeros(world_size(), dtype=torch.int64)
+    sizes[rank()] = len(content)
+    all_reduce([sizes])
+    if rank() > 0:
+        dist.send(torch.frombuffer(bytearray(content), dtype=torch.uint8), 0)
+        return
+    for number, size in enumerate(sizes.tolist()[1:], 1):
+        received = torch.empty(size, dtype=torch.uint8)
+        dist.recv(received, number)
+        yield number, received.numpy().tobytes()
 
 
 def mean(value: float) -> float:
@@ -91,22 +121,27 @@ def all_reduce(tensors: Iterable[Tensor]) -> None:
     if dist.is_initialized():
         for tensor in tensors:
             # Gloo adds in main memory.
-            shared = tensor.cpu()
+            shared = tensor if _adds_on_gpu(tensor) else tensor.cpu()
             dist.all_reduce(shared)
             if shared is not tensor:
                 tensor.copy_(shared)
 
 
+def _adds_on_gpu(tensor: Tensor) -> bool:
+    return tensor.is_cuda and "nccl" in dist.get_backend_config()
+
+
 def run_workers(count: int, work: Callable[..., None], arguments: tuple[Any, ...], report: Any) -> None:
     """Call `work(*arguments, report)` in `count` processes joined in a group, this one being the first.
 
-    Only the first worker gets `report`; the others get None in its place.
+    Only the first worker gets `report`; the others get None in its place. Ranks that are joined already all
+    call this, and start no process.
 
     Raises:
         DsarError: what any of them raised; without words of its own a worker that died is a TrainingError.
     """
-    if "RANK" in os.environ:
-        with _group("env://", int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"])):
+    if dist.is_initialized():
+        with naming_lost_ranks(), _one_thread():
             work(*arguments, report if rank() == 0 else None)
         return
     if count == 1:
@@ -162,7 +197,7 @@ def _work_beside(errors: Any, *arguments: Any) -> None:
         errors.put(error)
         sys.exit(1)
     except RuntimeError as error:
-        if _BACKEND not in str(error):
+        if not is_broken_group(error):
             raise
         sys.exit(1)  # the group broke: whoever broke it says why
 

@@ -3,10 +3,12 @@
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 import torch
@@ -39,12 +41,29 @@ def test_training_leaves_everything_the_contract_names_and_gets_better(trained):
     assert json.loads((trained.parent / "train.json").read_text())["step"] == 120
 
 
-def test_an_interrupted_run_resumes_to_the_same_bits(tiny_capture, tmp_path):
+TWO_WORKERS = ("--steps", "60", "--schedule.template-fraction", "0.1", "--workers", "2")
+
+
+@pytest.fixture(scope="module")
+def whole(tiny_capture, tmp_path_factory) -> Path:
+    """A run of two workers that nothing stopped."""
+    folder = tmp_path_factory.mktemp("whole") / "run"
+    finished(started(train_arguments(tiny_capture, folder, *TWO_WORKERS)))
+    return folder
+
+
+def assert_same_bits(run: Path, other: Path) -> None:
+    for name in ("avatar", "adam", "muon", "rollouts-0", "rollouts-1", "registration-0", "registration-1"):
+        a, b = (load_file(folder / "checkpoint" / f"{name}.safetensors") for folder in (run, other))
+        assert a.keys() == b.keys()
+        for key in a:
+            assert torch.equal(a[key], b[key]), f"{name}: {key}"
+
+
+def test_an_interrupted_run_resumes_to_the_same_bits(tiny_capture, whole, tmp_path):
     """Two workers; SIGINT once training moves, then the same command with --resume."""
-    whole, stopped = tmp_path / "whole", tmp_path / "stopped"
-    command = ("--steps", "60", "--workers", "2", "--schedule.template-fraction", "0.1")
-    finished(started(train_arguments(tiny_capture, whole, *command)))
-    process = started(train_arguments(tiny_capture, stopped, *command))
+    stopped = tmp_path / "stopped"
+    process = started(train_arguments(tiny_capture, stopped, *TWO_WORKERS))
     deadline = time.monotonic() + 120
     while not (stopped / "metrics.jsonl").exists() and time.monotonic() < deadline:
         time.sleep(0.01)
@@ -52,12 +71,8 @@ def test_an_interrupted_run_resumes_to_the_same_bits(tiny_capture, tmp_path):
     finished(process, 130)
     step = json.loads((stopped / "checkpoint" / "progress.json").read_text())["step"]
     assert 20 <= step < 60
-    finished(started(train_arguments(tiny_capture, stopped, *command, "--resume")))
-    for name in ("avatar", "adam", "muon", "rollouts-0", "rollouts-1"):
-        a, b = (load_file(folder / "checkpoint" / f"{name}.safetensors") for folder in (whole, stopped))
-        assert a.keys() == b.keys()
-        for key in a:
-            assert torch.equal(a[key], b[key]), f"{name}: {key}"
+    finished(started(train_arguments(tiny_capture, stopped, *TWO_WORKERS, "--resume")))
+    assert_same_bits(whole, stopped)
 
 
 def test_a_value_that_is_not_finite_stops_the_run_and_is_named(tiny_capture, tmp_path, capsys):
@@ -120,3 +135,94 @@ def test_a_run_that_was_too_slow_for_its_limit_says_so(tiny_capture, tmp_path, c
     assert round(at["skipped"]) == reached["skipped"]
     assert 1 < at["seconds"] < 6
     assert f"Cut short: {reached['step']} of" in (folder / "report.html").read_text()
+
+
+PROGRAM = """
+import os, pathlib, sys
+pathlib.Path(sys.argv.pop(1), f"rank-{os.environ['RANK']}").write_text(str(os.getpid()))
+from dsar.cli import main
+main()
+"""
+
+
+def ranks(folder, arguments) -> subprocess.Popen:
+    """Start two ranks; each leaves its process's number in the folder."""
+    program = folder / "program.py"
+    program.write_text(PROGRAM)
+    launcher = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
+    command = [sys.executable, *launcher, str(program), str(folder), *arguments]
+    environment = {**os.environ, "GLOO_SOCKET_IFNAME": "lo", "OMP_NUM_THREADS": "1"}
+    return subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
+
+
+def wait_for(path, process: subprocess.Popen) -> None:
+    """Wait until a file is there, or the process has ended."""
+    deadline = time.monotonic() + 120
+    while not path.exists() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.01)
+
+
+def said(process: subprocess.Popen) -> list[str]:
+    """Wait for the end of ranks that fail; return what `dsar` says, without what torchrun adds."""
+    _, message = process.communicate(timeout=60)
+    assert process.returncode not in (0, None), message
+    return [line for line in message.splitlines() if line.startswith("dsar: ")]
+
+
+@pytest.fixture(scope="module")
+def stopped(tiny_capture, tmp_path_factory):
+    """A run of two ranks that got SIGTERM in its midst, as from a cluster that wants its machines back."""
+    folder = tmp_path_factory.mktemp("ranks")
+    process = ranks(folder, train_arguments(tiny_capture, folder / "run", *TWO_WORKERS))
+    wait_for(folder / "run" / "metrics.jsonl", process)
+    process.send_signal(signal.SIGTERM)
+    (line,) = said(process)
+    assert "terminated; training is saved up to update" in line
+    step = json.loads((folder / "run" / "checkpoint" / "progress.json").read_text())["step"]
+    assert 20 <= step < 60
+    return folder / "run"
+
+
+@pytest.fixture
+def no_pictures(monkeypatch):
+    monkeypatch.setattr("dsar.cli.train.write_previews", lambda folder, _: folder)
+
+
+@pytest.mark.usefixtures("no_pictures")
+def test_two_ranks_are_two_workers_to_the_bit(tiny_capture, whole, stopped, tmp_path):
+    """What ranks began, workers end as if they had done it all."""
+    run = tmp_path / "run"
+    shutil.copytree(stopped, run)
+    main(train_arguments(tiny_capture, run, *TWO_WORKERS, "--resume"))
+    assert_same_bits(whole, run)
+    assert (whole / "config.json").read_text() == (run / "config.json").read_text()
+
+
+@pytest.mark.usefixtures("no_pictures")
+def test_a_run_goes_on_with_another_number_of_workers(tiny_capture, stopped, tmp_path, capsys):
+    run = tmp_path / "run"
+    shutil.copytree(stopped, run)
+    before = [load_file(run / "checkpoint" / f"rollouts-{rank}.safetensors") for rank in (0, 1)]
+    with pytest.raises(SystemExit):
+        main(train_arguments(tiny_capture, run, *TWO_WORKERS[:-1], "3", "--resume"))
+    assert "4 rollouts (2 workers of 2), which 3 workers" in capsys.readouterr().err
+    main(train_arguments(tiny_capture, run, *TWO_WORKERS[:-1], "1", "--resume"))
+    assert json.loads((run / "checkpoint" / "progress.json").read_text())["step"] == 60
+    assert not (run / "checkpoint" / "rollouts-1.safetensors").exists()
+    rollouts = load_file(run / "checkpoint" / "rollouts-0.safetensors")
+    assert len(rollouts["fresh"]) == sum(len(part["fresh"]) for part in before) == 4
+    # The settings say how the run began, so that its command stays the same.
+    assert json.loads((run / "config.json").read_text())["workers"] == 2
+
+
+def test_a_rank_that_dies_ends_all_with_one_line_and_leaves_nothing_half_written(tiny_capture, tmp_path):
+    process = ranks(tmp_path, train_arguments(tiny_capture, tmp_path / "run", "--steps", "100000"))
+    wait_for(tmp_path / "run" / "metrics.jsonl", process)
+    os.kill(int((tmp_path / "rank-1").read_text()), signal.SIGKILL)
+    began = time.monotonic()
+    (line,) = said(process)
+    assert time.monotonic() - began < 15, "it waited for who is gone"
+    assert "a rank of 2 ended before its time" in line
+    assert "no checkpoint was written yet" in line or "saved up to update" in line
+    left = {path.name for path in (tmp_path / "run").iterdir()}
+    assert left <= {"checkpoint", "config.json", "metrics.jsonl", "scene.safetensors"}
