@@ -196,13 +196,22 @@ def _changes(config: TrainConfig, room: Room) -> Iterator[list[_Change]]:
     for name in ("rollouts_per_worker", "views", "chunk_frames"):
         if changes := [_setting("schedule", name, value) for value in _halves(getattr(schedule, name))]:
             yield changes
-    if config.model.wiring == "shared":
-        yield [_setting("model", "wiring", "perframe")]
+    resolutions = (_setting("atlas", "resolution", value) for value in _halves(config.atlas.resolution))
+    if changes := [change for change in resolutions if _is_valid(change[1](config, room)[0])]:
+        yield changes
 
 
 def _setting(section: str, name: str, value: object) -> _Change:
     flag = f"--{section}.{name.replace('_', '-')} {value}"
     return flag, lambda config, room: (_with(config, section, **{name: value}), room)
+
+
+def _is_valid(config: TrainConfig) -> bool:
+    try:
+        config.validate()
+    except ConfigError:
+        return False
+    return True
 
 
 def _halves(count: int) -> Iterator[int]:

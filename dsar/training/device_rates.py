@@ -17,7 +17,7 @@ _SHORT_S = 2e-3
 """A run that takes less is made larger, if it may."""
 _FLOAT_BYTES = 4
 
-_Make = Callable[[int, torch.device], tuple[float, Callable[[], Tensor]]]
+_Make = Callable[[int, torch.device], tuple[int, Callable[[], Tensor]]]
 """From a size and a device to an amount of work, and what does it."""
 
 
@@ -83,7 +83,7 @@ def _time(run: Callable[[], Tensor]) -> float:
     return taken / runs
 
 
-def _convolution(images: int, device: torch.device) -> tuple[float, Callable[[], Tensor]]:
+def _convolution(images: int, device: torch.device) -> tuple[int, Callable[[], Tensor]]:
     layer = nn.Conv2d(_CHANNELS, _CHANNELS, 3, padding=1).to(device)
     x = torch.rand(images, _CHANNELS, _SIDE, _SIDE, device=device, requires_grad=True)
     x = x.to(memory_format=torch.channels_last)
@@ -94,19 +94,19 @@ def _convolution(images: int, device: torch.device) -> tuple[float, Callable[[],
     return 3 * 2 * 9 * _CHANNELS * x.numel(), run
 
 
-def _product(images: int, device: torch.device) -> tuple[float, Callable[[], Tensor]]:
+def _product(images: int, device: torch.device) -> tuple[int, Callable[[], Tensor]]:
     x = torch.rand(images * _SIDE, 16 * _SIDE, device=device)
     y = torch.rand(16 * _SIDE, 16 * _SIDE, device=device)
     return 2 * x.numel() * y.shape[1], lambda: x @ y
 
 
-def _copy(images: int, device: torch.device) -> tuple[float, Callable[[], Tensor]]:
+def _copy(images: int, device: torch.device) -> tuple[int, Callable[[], Tensor]]:
     x = torch.rand(images * _SIDE**4 // 16, device=device)
     y = torch.empty_like(x)
     return 2 * _FLOAT_BYTES * x.numel(), lambda: y.copy_(x)
 
 
-def _small_operations(images: int, device: torch.device) -> tuple[float, Callable[[], Tensor]]:
+def _small_operations(images: int, device: torch.device) -> tuple[int, Callable[[], Tensor]]:
     x = torch.zeros(1, device=device)
 
     def run() -> Tensor:
