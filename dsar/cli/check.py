@@ -93,7 +93,7 @@ class Check(Common):
         from dsar.training.device_rates import measure_rates
 
         config = PRESETS["demo"]
-        view = max((camera.height for camera in cameras)), max((camera.width for camera in cameras))
+        view = max(camera.height for camera in cameras), max(camera.width for camera in cameras)
         budget = estimate(config, view)
         rate = measure_rates(torch.device("cpu")).convolution
         seconds = budget.cost.network_flop / rate * config.schedule.steps

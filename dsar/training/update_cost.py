@@ -70,6 +70,7 @@ class UpdateCost:
         """Floating-point operations of the network: forward, and twice as many on the way back."""
         return 3 * sum(o.flop for o in self.operations if o.part == NETWORK)
 
+
 def map_size(config: TrainConfig) -> tuple[int, int]:
     """Return height and width of the network's maps; with a garment chart, if one may come."""
     rows, columns = atlas_size(config)

@@ -130,14 +130,16 @@ def test_recomputing_takes_a_third_more_of_the_network():
 @pytest.mark.parametrize(
     ("gib", "config", "room"),
     [
-        (9, PAPER, ROOM),
+        (9.5, PAPER, ROOM),
         (15, with_schedule(PAPER, recomputation="off"), dataclasses.replace(ROOM, processes=2)),
-        (1, PRESETS["demo"], dataclasses.replace(ROOM, device=torch.device("cpu"), processes=2)),
+        (2.5, SMALL, dataclasses.replace(ROOM, device=torch.device("cpu"), processes=4)),
     ],
 )
 def test_what_a_refusal_advises_fits(card, gib, config, room):
     card(gib)
-    with pytest.raises(ConfigError, match=rf"about \d+\.\d GiB, {gib:.1f} GiB are free; most is for ") as error:
+    with pytest.raises(
+        ConfigError, match=rf"about \d+\.\d GiB, {gib:.1f} GiB are free; most is for "
+    ) as error:
         budget.check_budget(config, room)
     advice = re.findall(r"(--.+?) \((\d+\.\d) GiB\)", str(error.value).split("What fits: ")[1])
     assert advice
@@ -161,7 +163,7 @@ def test_what_a_refusal_advises_fits(card, gib, config, room):
 def test_a_refusal_names_no_setting_where_none_helps(card):
     card(0.5)
     with pytest.raises(ConfigError, match="No setting makes it fit: take another device"):
-        budget.check_budget(PAPER, ROOM)
+        budget.check_budget(SMALL, ROOM)
 
 
 def test_flags_of_the_advice_are_flags_of_the_command(capsys):
@@ -190,7 +192,8 @@ def test_memory_and_hours_are_said(card, caplog):
     with caplog.at_level("INFO"):
         budget.check_budget(PAPER, ROOM)
     assert re.search(
-        r"about \d+\.\d GiB of 80\.0 that are free, an update 0\.\d\d s or more, the run \d+\.\d hours", caplog.text
+        r"about \d+\.\d GiB of 80\.0 that are free, an update 0\.\d\d s or more, the run \d+\.\d hours",
+        caplog.text,
     )
 
 

@@ -43,7 +43,12 @@ def test_what_was_made_before_counts_once_it_is_followed():
 
 def network():
     torch.manual_seed(0)
-    layers = (torch.nn.Conv2d(3, 8, 3, padding=1), torch.nn.ReLU(), torch.nn.Conv2d(8, 8, 3), torch.nn.Flatten(2))
+    layers = (
+        torch.nn.Conv2d(3, 8, 3, padding=1),
+        torch.nn.ReLU(),
+        torch.nn.Conv2d(8, 8, 3),
+        torch.nn.Flatten(2),
+    )
     return torch.nn.Sequential(*layers, torch.nn.Linear(36, 5))
 
 
