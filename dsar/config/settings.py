@@ -196,9 +196,9 @@ class ScheduleConfig:
     max_gradient_norm: float = 1.0
     """Largest norm of the network's gradient."""
     recomputation: Literal["auto", "on", "off"] = "auto"
-    """`on`: the network's activations are computed again on the way back instead of kept till then (extension):
-    a third more arithmetic, the same gradients, and memory for a frame instead of `chunk_frames`; `auto`: where
-    they would not fit."""
+    """`on`: the network's activations are computed again on the way back instead of kept till then
+    (extension): a third more arithmetic, the same gradients, and activations of one frame in memory instead of
+    `chunk_frames`; `auto`: where all would not fit."""
 
 
 @dataclass(frozen=True)

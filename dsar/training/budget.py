@@ -150,8 +150,8 @@ def _decided(config: TrainConfig, room: Room, free: int | None) -> Budget:
         return kept
     again = estimate(_with(config, "schedule", recomputation="on"), room.view, room.device)
     _log.info(
-        "With activations kept, training needs %.1f GiB of %.1f that are free: they are computed again on the "
-        "way back, which takes %.1f GiB and more time (--schedule.recomputation)",
+        "With activations kept, training needs %.1f GiB of %.1f that are free: they are computed again on "
+        "the way back, which takes %.1f GiB and more time (--schedule.recomputation)",
         room.needed(kept) / _GIB,
         free / _GIB,
         room.needed(again) / _GIB,

@@ -11,7 +11,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
@@ -40,8 +39,10 @@ class OperationMeter(TorchDispatchMode):
     Not seen: what libraries take behind torch's back, and what an allocator rounds up.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, device: str) -> None:
+        """Begin with nothing; only tensors on devices of a type count."""
         super().__init__()
+        self._device = device
         self.operations: list[Operation] = []
         """All of them, in their order."""
         self.live: Counter[str] = Counter()
@@ -73,12 +74,12 @@ class OperationMeter(TorchDispatchMode):
         """Run an operation, and note what it makes."""
         kwargs = kwargs or {}
         made = func(*args, **kwargs)
-        given = {_place(tensor): tensor for tensor in _tensors((args, kwargs))}
-        results = list(_tensors(made))
+        given = {_place(tensor): tensor for tensor in self._tensors((args, kwargs))}
+        results = list(self._tensors(made))
         for tensor in results:
             self._follow(tensor)
         fresh = [tensor for tensor in results if _place(tensor) not in given]
-        if fresh or func._schema.is_mutable:
+        if fresh or (given and func._schema.is_mutable):
             self._note(func, args, kwargs, made, [*given.values(), *fresh])
         return made
 
@@ -90,6 +91,9 @@ class OperationMeter(TorchDispatchMode):
             kind = "convolution" if "convolution" in func._schema.name else "product"
         traffic = sum(tensor.numel() * tensor.element_size() for tensor in touched)
         self.operations.append(Operation(self._part, kind, flop, traffic))
+
+    def _tensors(self, tree: Any) -> Iterator[Tensor]:
+        return (x for x in tree_leaves(tree) if isinstance(x, Tensor) and x.device.type == self._device)
 
     def _follow(self, tensor: Tensor) -> None:
         storage = tensor.untyped_storage()
@@ -112,7 +116,3 @@ class OperationMeter(TorchDispatchMode):
 def _place(tensor: Tensor) -> int:
     """Return what tells the tensor's memory from others'; views share it."""
     return tensor.untyped_storage()._cdata
-
-
-def _tensors(tree: Any) -> Iterator[Tensor]:
-    return (leaf for leaf in tree_leaves(tree) if isinstance(leaf, torch.Tensor))

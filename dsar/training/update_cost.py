@@ -20,7 +20,7 @@ from dsar.config import TrainConfig
 from dsar.metrics.lpips import Lpips
 from dsar.network import NetworkOutput, NetworkState, build_network
 from dsar.training.driving_maps import CAPACITY
-from dsar.training.losses import image_loss
+from dsar.training.image_losses import image_losses
 from dsar.training.operation_meter import Operation, OperationMeter
 from dsar.training.targets import Target
 from dsar.training.temporal_losses import TemporalHistory, TemporalRecord, temporal_losses
@@ -87,7 +87,7 @@ class _ImitatedUpdate:
     """An update on the meta device, part by part."""
 
     def __init__(self, config: TrainConfig, view: tuple[int, int]) -> None:
-        self.config, self.view, self.meter = config, view, OperationMeter()
+        self.config, self.view, self.meter = config, view, OperationMeter(_META.type)
         schedule, size = config.schedule, map_size(config)
         self.rollouts, points = schedule.rollouts_per_worker, size[0] * size[1]
         self.rendered = max(1, math.ceil(schedule.rendered_fraction * self.rollouts))
@@ -142,8 +142,7 @@ class _ImitatedUpdate:
                     gaussians += self._pose(output)
                 with meter.part(TEMPORAL):
                     loss = loss + self._compare_frames(output, history)
-            views = [self._view(frame) for frame in gaussians for _ in range(schedule.views)]
-            loss = loss + torch.stack(views).sum()
+            loss = loss + self._compare_views(gaussians)
             with meter.part(BACKWARD):
                 # Now and then the losses' gradients are compared, which needs the graph more than once.
                 loss.backward(retain_graph=True)
@@ -188,17 +187,22 @@ class _ImitatedUpdate:
         )
         return torch.stack(list(losses.values())).sum()
 
-    def _view(self, gaussians: Gaussians) -> Tensor:
-        """Return the losses of a view of some Gaussians."""
-        (height, width), config = self.view, self.config.loss
+    def _compare_views(self, gaussians: list[Gaussians]) -> Tensor:
+        """Return the summed losses of the views of some frames."""
+        (height, width), config = self.view, self.config
+        camera, targets = Camera(torch.eye(3), torch.eye(4), width, height, "view"), []
         with self.meter.part(RASTERIZER):
-            fields = [getattr(gaussians, f.name) for f in dataclasses.fields(Gaussians)]
-            color, alpha, depth = _ImitatedDrawing.apply(self.view, *fields)  # pyright: ignore
-        with self.meter.part(IMAGES):
-            image = RenderOutput(color, alpha, depth, torch.empty((), dtype=torch.int64, device=_META))
-            camera = Camera(torch.eye(3), torch.eye(4), width, height, "view")
-            target = Target(torch.empty_like(color), torch.empty_like(alpha), camera)
-            return image_loss(image, target, color.new_empty(3), config, self.lpips)[0]
+            images = [self._draw(frame) for frame in gaussians for _ in range(config.schedule.views)]
+        with self.meter.part(IMAGES), _META:
+            for _ in images:
+                targets.append(Target(torch.empty(height, width, 3), torch.empty(height, width), camera))
+            backgrounds = torch.empty(len(images), 3)
+            return image_losses(images, targets, backgrounds, config.loss, self.lpips)[0].sum()
+
+    def _draw(self, gaussians: Gaussians) -> RenderOutput:
+        fields = [getattr(gaussians, field.name) for field in dataclasses.fields(Gaussians)]
+        color, alpha, depth = _ImitatedDrawing.apply(self.view, *fields)  # pyright: ignore
+        return RenderOutput(color, alpha, depth, torch.empty((), dtype=torch.int64, device=_META))
 
 
 class _ImitatedDrawing(torch.autograd.Function):

@@ -92,7 +92,7 @@ def test_a_real_chunk_and_its_way_back_take_the_memory_that_meta_says(recomputes
             maps, magnitude = torch.zeros(3, config.model.map_channels, 8, 8), torch.zeros(3, 1, 8, 8)
             state = network.initial_state(3)
         state = dataclasses.replace(state, fresh=torch.zeros(3, dtype=torch.bool))
-        meter, loss = OperationMeter(), torch.zeros((), device=device)
+        meter, loss = OperationMeter(device), torch.zeros((), device=device)
         with meter:
             for _ in range(4):
                 output, state = network(maps, magnitude, state)

@@ -13,7 +13,7 @@ FLOATS = 4
 
 
 def test_memory_is_counted_while_it_lives_and_by_part():
-    with OperationMeter() as meter:
+    with OperationMeter("cpu") as meter:
         with meter.part("first"):
             a = torch.zeros(1000)
         with meter.part("second"):
@@ -34,7 +34,7 @@ def test_memory_is_counted_while_it_lives_and_by_part():
 
 def test_what_was_made_before_counts_once_it_is_followed():
     before = torch.zeros(50)
-    meter = OperationMeter()
+    meter = OperationMeter("cpu")
     meter.follow("weights", [before, before[:5]])
     with meter:
         before.add_(1)
@@ -57,7 +57,7 @@ def test_a_step_on_meta_is_metered_as_on_the_cpu(recomputed):
     found = []
     for device in ("cpu", "meta"):
         layers, x = network().to(device), torch.rand(2, 3, 8, 8).to(device)
-        meter, counter = OperationMeter(), FlopCounterMode(display=False)
+        meter, counter = OperationMeter(device), FlopCounterMode(display=False)
         with counter, meter:
             y = checkpoint(layers, x, use_reentrant=False) if recomputed else layers(x)
             y.sum().backward()
@@ -69,7 +69,7 @@ def test_a_step_on_meta_is_metered_as_on_the_cpu(recomputed):
 
 def test_traffic_is_what_is_read_and_written():
     x, y = torch.zeros(100), torch.zeros(100, dtype=torch.float64)
-    with OperationMeter() as meter:
+    with OperationMeter("cpu") as meter:
         x.view(10, 10).t()  # no memory is touched
         y.add_(x)
         x + x
