@@ -197,8 +197,8 @@ class ScheduleConfig:
     """Largest norm of the network's gradient."""
     recomputation: Literal["auto", "on", "off"] = "auto"
     """`on`: the network's activations are computed again on the way back instead of kept till then
-    (extension): a third more arithmetic, the same gradients, and activations of one frame in memory instead of
-    `chunk_frames`; `auto`: where all would not fit."""
+    (extension): a third more arithmetic, the same gradients, one frame's activations in memory instead of
+    those of `chunk_frames`; `auto`: where these would not fit."""
 
 
 @dataclass(frozen=True)
