@@ -121,8 +121,8 @@ class DualStreamNetwork(nn.Module):
         """
         if self.recomputes and torch.is_grad_enabled():
             # Nothing here is random, and to keep the generator's state a GPU would be waited for.
-            options = {"use_reentrant": False, "preserve_rng_state": False}
-            return checkpoint(self._step, maps, magnitude, state, streams, **options)
+            given = maps, magnitude, state, streams
+            return checkpoint(self._step, *given, use_reentrant=False, preserve_rng_state=False)
         return self._step(maps, magnitude, state, streams)
 
     def _step(
