@@ -13,8 +13,10 @@ from dsar.errors import ConfigError
 from dsar.network import build_network
 from dsar.training import budget
 from dsar.training.budget import Room
+from dsar.training.checkpoint import Run
 from dsar.training.device_rates import DeviceRates, measure_rates
 from dsar.training.operation_meter import Operation, OperationMeter
+from dsar.training.resuming import check_same_settings
 from dsar.training.update_cost import BACKWARD, NETWORK, cost_of_update, estimate_pairs, map_size
 
 GIB = 2**30
@@ -116,6 +118,12 @@ def test_activations_are_kept_where_there_is_room(card):
     found = budget.check_budget(PAPER, ROOM)
     assert found.config.schedule.recomputation == "off"
     assert 20 * GIB < found.memory < 0.9 * 39 * GIB
+
+
+def test_a_resumed_run_may_recompute_or_not_and_change_nothing_else(tmp_path):
+    check_same_settings(with_schedule(PAPER, recomputation="on"), PAPER, Run(tmp_path))
+    with pytest.raises(ConfigError, match="other values of schedule"):
+        check_same_settings(with_schedule(PAPER, recomputation="on", views=2), PAPER, Run(tmp_path))
 
 
 def test_recomputing_takes_a_third_more_of_the_network():
