@@ -22,6 +22,7 @@ from dsar.devices import choose_device
 from dsar.evaluation.profiling import read_clock
 from dsar.metrics.lpips import Lpips
 from dsar.training.chunk import ChunkTrainer
+from dsar.training.draws import Draws
 from dsar.training.kept_views import KeptViews
 from dsar.training.loop import rest_frames, training_clips
 from dsar.training.optimizers import set_rates
@@ -111,14 +112,14 @@ class Updates:
         """Do one update of the stage that is due at a place of the schedule."""
         state, now = self.state, schedule_at(self.config.schedule, progress)
         set_rates(state.optimizers, now)
-        rng = np.random.default_rng([0, 0, state.step])
+        draws = Draws(0, state.step)
         self.gradients.clear()
         if now.stage == "template":
-            self.trainer.backward_template(rng, now.reduction)
+            self.trainer.backward_template(draws, now.reduction)
         elif now.stage == "pretraining":
-            self.trainer.backward_pretraining(rng)
+            self.trainer.backward_pretraining(draws)
         else:
-            self.trainer.backward_chunk(rng, now)
+            self.trainer.backward_chunk(draws, now)
         nn.utils.clip_grad_norm_(state.avatar.network.parameters(), self.config.schedule.max_gradient_norm)
         for optimizer in state.optimizers.values():
             optimizer.step()

@@ -28,6 +28,7 @@ from dsar.data.captures.formats import open_capture
 from dsar.data.captures.multiview import MultiViewCapture
 from dsar.data.images import decoding
 from dsar.training.chunk import ChunkTrainer
+from dsar.training.draws import Draws
 from dsar.training.kept_views import KeptViews
 from dsar.training.loop import training_clips
 from dsar.training.schedule import schedule_at
@@ -139,10 +140,10 @@ def measure(capture: MultiViewCapture, updates: int) -> dict:
     for update in range(-2, updates):
         for name, loader in (("at_once", AtOnce(kept)), ("ahead", ahead)):
             trainer.loader = loader
-            rng = np.random.default_rng(update + 2)
+            draws = Draws(0, update + 2)
             avatar.zero_grad()
             began = time.perf_counter()
-            trainer.backward_chunk(rng, now)
+            trainer.backward_chunk(draws, now)
             if update >= 0:
                 seconds[name].append(time.perf_counter() - began)
             elif name == "ahead":

@@ -38,6 +38,8 @@ from dsar.training.workers import Gradients
 
 PROGRESS = {"template": 0.06, "pretraining": 0.2, "reduced": 0.6, "whole": 0.9}
 """Places in the schedule, by what they measure; images are reduced or whole."""
+CENTIMETRE = 0.01
+"""Offset, metres, of every registered map: what pretraining learns here."""
 FIRST_FRAME = 30
 """Registered frames are measured from here on."""
 
@@ -54,6 +56,15 @@ def images(capture: Any, *, kept: bool) -> Any:
             for camera in capture.cameras_with_image(name, frame):
                 views.read(name, frame, camera)
     return views
+
+
+def draws(step: int) -> Any:
+    """Return the random numbers of an update; in revisions before all rollouts shared one generator."""
+    try:
+        from dsar.training.draws import Draws
+    except ImportError:
+        return np.random.default_rng([0, 0, step])
+    return Draws(0, step)
 
 
 class Worker:
@@ -81,19 +92,20 @@ class Worker:
         avatar.unhide_covered_texels()
         for name, clip in clips.items():
             state.registered.fitted[name] = torch.tensor(len(clip))
+            state.registered.offsets[name].fill_(CENTIMETRE)
 
     def update(self, part: str, progress: float) -> float:
         """Do one update; return its loss."""
         state, now = self.state, schedule_at(self.config.schedule, progress)
         set_rates(state.optimizers, now)
-        rng = np.random.default_rng([0, 0, state.step])
+        chance = draws(state.step)
         self.gradients.clear()
         if part == "template":
-            metrics = self.trainer.backward_template(rng, now.reduction)
+            metrics = self.trainer.backward_template(chance, now.reduction)
         elif part == "pretraining":
-            metrics = self.trainer.backward_pretraining(rng)
+            metrics = self.trainer.backward_pretraining(chance)
         else:
-            metrics = self.trainer.backward_chunk(rng, now)
+            metrics = self.trainer.backward_chunk(chance, now)
         nn.utils.clip_grad_norm_(state.avatar.network.parameters(), self.config.schedule.max_gradient_norm)
         for optimizer in state.optimizers.values():
             optimizer.step()
@@ -153,7 +165,6 @@ def summarize(before: list[dict], after: list[dict]) -> dict[str, Any]:
             "before_ms": medians[0],
             "after_ms": medians[1],
             "ratio": medians[0] / medians[1],
-            # The first of pretraining is 0: nothing is registered here, and nothing learnt.
             "losses_apart": float(np.abs(losses[0] - losses[1]).max() / np.abs(losses[0]).max()),
         }
     return rows

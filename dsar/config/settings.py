@@ -169,6 +169,8 @@ class ScheduleConfig:
     """Fraction trained on images of half the size; the template is fitted to whole ones."""
     rollouts_per_worker: int = 64
     """Rollouts that one worker steps together, its batch."""
+    template_frames_per_worker: int = 8
+    """Near-rest frames that one worker draws in an update of the template alone."""
     views: int = 1
     """Cameras rendered per rollout and rendered frame."""
     rendered_fraction: float = 0.5
@@ -236,7 +238,7 @@ class TrainConfig:
         counts = {f"model.{name}": getattr(model, name) for name in ("upsample", "pixel_shuffle", "heads")}
         counts |= {
             f"schedule.{name}": getattr(schedule, name)
-            for name in ("rollouts_per_worker", "chunk_frames", "views")
+            for name in ("rollouts_per_worker", "template_frames_per_worker", "chunk_frames", "views")
         }
         for name, count in counts.items():
             if count < 1:

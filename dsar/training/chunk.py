@@ -4,7 +4,7 @@ import dataclasses
 import math
 import os
 from collections import defaultdict
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +18,7 @@ from dsar.devices import send
 from dsar.errors import TrainingError
 from dsar.network import STREAMS, NetworkOutput, Stream
 from dsar.training import workers
+from dsar.training.draws import Draws
 from dsar.training.driving_maps import DrivingFrames, DrivingMaps
 from dsar.training.kept_views import KeptViews
 from dsar.training.losses import CENTIMETRES, registered_loss, spatial_loss
@@ -30,13 +31,22 @@ from dsar.training.temporal_losses import TemporalRecord, temporal_losses
 from dsar.training.view_batch import ViewBatch
 from dsar.types import Gaussians
 
-TEMPLATE_FRAMES = 8
-"""Frames of an update of the template alone."""
+
+@dataclass(frozen=True)
+class _Frame:
+    """Which frame of every rollout comes next."""
+
+    cursors: list[RolloutCursor]
+    """Where each rollout stands."""
+    fresh: list[bool]
+    """Which rollouts start afresh."""
+    rendered: list[int]
+    """Numbers of those that are compared with images."""
 
 
 @dataclass(frozen=True)
 class _Step:
-    """One frame of every rollout."""
+    """One frame of every rollout, as the network has it."""
 
     cursors: list[RolloutCursor]
     """Where each rollout stood."""
@@ -82,53 +92,61 @@ class ChunkTrainer:
         self.signals = signals
         self.driving = DrivingMaps(self.avatar, signals, mirrored=self.mirror is not None)
 
-    def backward_template(self, rng: np.random.Generator, reduction: int) -> UpdateMetrics:
+    def backward_template(self, draws: Draws, reduction: int) -> UpdateMetrics:
         """Back-propagate views of the template in the shapes it has in still frames."""
-        rest, views = self.state.rest, self._view_batch(rng, reduction)
-        chosen = rng.choice(len(rest.frames), TEMPLATE_FRAMES)
+        rest, views = self.state.rest, self._view_batch(reduction)
+        generators = draws.generators(self.config.schedule.template_frames_per_worker)
+        chosen = [int(rng.integers(len(rest.frames))) for rng in generators]
         frames = [rest.frames[index] for index in chosen]
-        count = max(views.request(frames), 1)
+        for rng, (name, frame) in zip(generators, frames, strict=True):
+            views.request(rng, name, frame)
+        count = workers.begin_mean(float(len(views)))
         windows = torch.stack([self.signals[name].windows[frame, :1] for name, frame in frames])
-        outputs = rest.output(self.avatar, send(torch.from_numpy(chosen), self.device))
-        gaussians = self.avatar.gaussians(windows, outputs)
-        loss, mse = views.compare(gaussians, self.config.loss, self.lpips)
-        return self._backward(loss + count * rest.loss(self.avatar, self.config.loss), mse, count)
+        outputs = rest.output(self.avatar, send(torch.tensor(chosen), self.device))
+        rendered, mse = self._compare(views, self.avatar.gaussians(windows, outputs), count)
+        return self._backward(rendered + rest.loss(self.avatar, self.config.loss), mse)
 
-    def backward_pretraining(self, rng: np.random.Generator) -> UpdateMetrics:
+    def backward_pretraining(self, draws: Draws) -> UpdateMetrics:
         """Step every rollout by K frames and back-propagate the distance to the registered maps."""
         self._show_whole_body()
-        loss = self._zero()
-        for _ in range(self.config.schedule.chunk_frames):
-            step = self._step(*self.state.rollouts.next_frames(rng, WHOLE_CLIP), streams=STREAMS)
-            loss = loss + self._registered_distance(step) + self._residual(step)
+        loss, frames = self._zero(), self.config.schedule.chunk_frames
+        generators = draws.generators(len(self.state.rollouts.cursors))
+        for _ in range(frames):
+            frame = self._next_frame(generators, WHOLE_CLIP, rendered_fraction=0.0)
+            step = self._step(frame, streams=STREAMS)
+            loss = loss + (self._registered_distance(step) + self._residual(step)) / frames
         self._detach_state()
-        return self._backward(loss, None, self.config.schedule.chunk_frames)
+        return self._backward(loss, None)
 
     def backward_chunk(
-        self, rng: np.random.Generator, schedule_state: ScheduleState, *, probe: bool = False
+        self, draws: Draws, schedule_state: ScheduleState, *, probe: bool = False
     ) -> UpdateMetrics:
         """Step every rollout by K frames and back-propagate L_total (paper equation 22).
 
-        The whole body is shown. L_total has losses over space and to registered maps besides. With `probe`,
-        report how the gradients of the losses compare.
+        The whole body is shown. L_total has losses over space and to registered maps besides. Images count by
+        the view, all else by the frame. With `probe`, report how the gradients of the losses compare.
         """
         self._show_whole_body()
         schedule = self.config.schedule
         streams = STREAMS if schedule_state.stage == "autoregressive" else ()
         losses: dict[str, Tensor] = defaultdict(self._zero)
-        views, gaussians = self._view_batch(rng, schedule_state.reduction), list[Gaussians]()
-        for _ in range(schedule.chunk_frames):
-            cursors, fresh = self.state.rollouts.next_frames(rng, schedule_state.max_rollout_frames)
-            rendered = [i for i in range(len(cursors)) if rng.random() < schedule.rendered_fraction]
-            added = views.request((cursors[i].sequence, cursors[i].frame) for i in rendered)
-            step = self._step(cursors, fresh, streams=streams)
-            gaussians += self._pose(step, rendered) if rendered else []
+        views, gaussians = self._view_batch(schedule_state.reduction), list[Gaussians]()
+        generators = draws.generators(len(self.state.rollouts.cursors))
+        longest, fraction = schedule_state.max_rollout_frames, schedule.rendered_fraction
+        frames = [self._next_frame(generators, longest, fraction) for _ in range(schedule.chunk_frames)]
+        for frame in frames:
+            for i in frame.rendered:
+                views.request(generators[i], frame.cursors[i].sequence, frame.cursors[i].frame)
+        count = workers.begin_mean(float(len(views)))
+        for frame in frames:
+            step = self._step(frame, streams=streams)
+            gaussians += self._pose(step, frame.rendered) if frame.rendered else []
             for name, loss in self._regularizers(step, streams).items():
-                losses[name] = losses[name] + loss * added
+                losses[name] = losses[name] + loss / schedule.chunk_frames
         self._detach_state()
-        losses["render"], mse = views.compare(gaussians, self.config.loss, self.lpips)
+        losses["render"], mse = self._compare(views, gaussians, count)
         gradients = self._compare_gradients(losses) if probe else None
-        metrics = self._backward(torch.stack(list(losses.values())).sum(), mse, max(len(views), 1))
+        metrics = self._backward(torch.stack(list(losses.values())).sum(), mse)
         return dataclasses.replace(metrics, gradients=gradients)
 
     def _show_whole_body(self) -> None:
@@ -137,10 +155,20 @@ class ChunkTrainer:
             self.avatar.unhide_covered_texels()
             self._shown = True
 
-    def _step(self, cursors: list[RolloutCursor], fresh: list[bool], *, streams: Collection[Stream]) -> _Step:
-        """Step every rollout by one frame, some of them afresh."""
-        state = self.state
-        state.network = state.network.restart(send(torch.tensor(fresh), self.device))
+    def _next_frame(
+        self, generators: Sequence[np.random.Generator], longest: int, rendered_fraction: float
+    ) -> _Frame:
+        """Move every rollout one frame on, some of them to a fresh start."""
+        cursors, fresh = self.state.rollouts.next_frames(generators, longest)
+        cursors = [dataclasses.replace(cursor) for cursor in cursors]
+        self.state.rollouts.advance()
+        rendered = [i for i, rng in enumerate(generators) if rng.random() < rendered_fraction]
+        return _Frame(cursors, fresh, rendered)
+
+    def _step(self, frame: _Frame, *, streams: Collection[Stream]) -> _Step:
+        """Step the network of every rollout by a frame."""
+        state, cursors = self.state, frame.cursors
+        state.network = state.network.restart(send(torch.tensor(frame.fresh), self.device))
         driving = self.driving.gather(cursors)
         output, state.network = self.avatar.network(
             driving.maps, driving.magnitude, state.network, streams=streams
@@ -148,8 +176,6 @@ class ChunkTrainer:
         output = dataclasses.replace(output, offset=output.offset + driving.base)
         mirrored = send(torch.tensor([cursor.mirrored for cursor in cursors]), self.device)
         unmirrored = self.mirror.unmirror(output, mirrored) if self.mirror is not None else output
-        cursors = [dataclasses.replace(cursor) for cursor in cursors]
-        state.rollouts.advance()
         return _Step(cursors, driving, output, unmirrored)
 
     def _pose(self, step: _Step, rollouts: list[int]) -> list[Gaussians]:
@@ -164,8 +190,19 @@ class ChunkTrainer:
         self.state.network = self.state.network.detach()
         self.state.history.detach()
 
-    def _view_batch(self, rng: np.random.Generator, reduction: int) -> ViewBatch:
-        return ViewBatch(self.loader, rng, reduction, self.config.schedule.views)
+    def _view_batch(self, reduction: int) -> ViewBatch:
+        return ViewBatch(self.loader, reduction, self.config.schedule.views)
+
+    def _compare(
+        self, views: ViewBatch, gaussians: list[Gaussians], count: Callable[[], float]
+    ) -> tuple[Tensor, Tensor]:
+        """Return loss and squared error of views, divided by how many a worker has in the mean.
+
+        So their mean over workers is the mean over all views, of which one may have more than another.
+        """
+        loss, mse = views.compare(gaussians, self.config.loss, self.lpips)
+        mean_count = count() or 1.0
+        return loss / mean_count, mse / mean_count
 
     def _regularizers(self, step: _Step, streams: Collection[Stream]) -> dict[str, Tensor]:
         """Return the weighted losses of a frame that need no image, by name."""
@@ -220,8 +257,7 @@ class ChunkTrainer:
             self.config.loss,
         )
 
-    def _backward(self, loss: Tensor, mse: Tensor | None, count: int) -> UpdateMetrics:
-        loss = loss / count
+    def _backward(self, loss: Tensor, mse: Tensor | None) -> UpdateMetrics:
         # Read together: the host waits for a GPU once.
         value, error = torch.stack([loss.detach(), mse if mse is not None else self._zero()]).tolist()
         if not math.isfinite(value):
@@ -229,7 +265,7 @@ class ChunkTrainer:
                 f"the loss is {value}; first tensor that is not finite: {self._first_not_finite()}"
             )
         loss.backward()
-        return UpdateMetrics(value, error / count if mse is not None else None)
+        return UpdateMetrics(value, error if mse is not None else None)
 
     def _zero(self) -> Tensor:
         return torch.zeros((), device=self.device)

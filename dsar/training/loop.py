@@ -5,7 +5,6 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import nn
 
@@ -21,6 +20,7 @@ from dsar.training import launch, workers
 from dsar.training.budget import Room, check_budget
 from dsar.training.checkpoint import Run, check_files, load_checkpoint, read_config, read_progress
 from dsar.training.chunk import ChunkTrainer
+from dsar.training.draws import Draws
 from dsar.training.kept_views import KeptViews, kept_bytes, largest_crop
 from dsar.training.layers import Layers
 from dsar.training.optimizers import keep_still, set_rates
@@ -188,9 +188,9 @@ def _train(
                 # Asked once, for the answers make the host wait for a GPU.
                 dressed = True
             set_rates(state.optimizers, schedule_state)
-            rng = np.random.default_rng([config.seed, workers.rank(), state.step])
+            draws = Draws(config.seed, state.step, workers.rank())
             gradients.clear()
-            metrics = _backward(trainer, rng, schedule_state, state.step)
+            metrics = _backward(trainer, draws, schedule_state)
             monitor.update(metrics)
             stop, seconds = gradients.average(bool(received), clock.seconds())
             if not gradients.buffer.isfinite().all():
@@ -237,20 +237,17 @@ def _register(
     return stop
 
 
-def _backward(
-    trainer: ChunkTrainer, rng: np.random.Generator, schedule_state: ScheduleState, step: int
-) -> UpdateMetrics:
+def _backward(trainer: ChunkTrainer, draws: Draws, schedule_state: ScheduleState) -> UpdateMetrics:
     """Compute the gradients of one update."""
     try:
         if schedule_state.stage == "template":
-            return trainer.backward_template(rng, schedule_state.reduction)
+            return trainer.backward_template(draws, schedule_state.reduction)
         if schedule_state.stage == "pretraining":
-            return trainer.backward_pretraining(rng)
-        return trainer.backward_chunk(
-            rng, schedule_state, probe=workers.rank() == 0 and step % PROBE_EVERY == 0
-        )
+            return trainer.backward_pretraining(draws)
+        probe = draws.worker == 0 and draws.step % PROBE_EVERY == 0
+        return trainer.backward_chunk(draws, schedule_state, probe=probe)
     except TrainingError as error:
-        raise TrainingError(f"step {step} ({schedule_state.stage}): {error}") from error
+        raise TrainingError(f"step {draws.step} ({schedule_state.stage}): {error}") from error
 
 
 def training_clips(capture: Capture) -> dict[str, range]:

@@ -1,7 +1,7 @@
 """The rollouts that a worker trains on: which frame of which sequence each one sees next."""
 
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,9 +32,11 @@ class RolloutBatch:
         self.cursors: list[RolloutCursor | None] = [None] * count
 
     def next_frames(
-        self, rng: np.random.Generator, max_rollout_frames: int
+        self, generators: Sequence[np.random.Generator], max_rollout_frames: int
     ) -> tuple[list[RolloutCursor], list[bool]]:
         """Return where each rollout stands, and which of them start afresh with this frame.
+
+        Each has a generator of its own.
 
         A rollout restarts at the end of its clip or after `max_rollout_frames`: in the middle of a clip
         while those are few, at a clip's first frame (where cloth is at rest) once they are not. The first
@@ -48,7 +50,9 @@ class RolloutBatch:
                 or cursor.age >= max_rollout_frames
             )
             if ended:
-                self.cursors[index] = self._restart(rng, max_rollout_frames, anywhere=cursor is None)
+                self.cursors[index] = self._restart(
+                    generators[index], max_rollout_frames, anywhere=cursor is None
+                )
             fresh.append(ended)
         return [cursor for cursor in self.cursors if cursor is not None], fresh
 

@@ -1,6 +1,6 @@
 """The views that an update compares with images: loaded while the network computes, drawn in one call."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future
 
 import numpy as np
@@ -19,16 +19,15 @@ from dsar.types import Gaussians
 class ViewBatch:
     """Views of the frames of an update, each on a background drawn by chance."""
 
-    def __init__(self, loader: TargetLoader, rng: np.random.Generator, reduction: int, views: int) -> None:
+    def __init__(self, loader: TargetLoader, reduction: int, views: int) -> None:
         """Begin without a frame.
 
         Args:
             loader: Loads the images.
-            rng: Chooses cameras and backgrounds.
             reduction: Factor by which images are reduced.
             views: Cameras of a frame, as many as there are at most.
         """
-        self._loader, self._rng = loader, rng
+        self._loader = loader
         self._reduction, self._views = reduction, views
         self._targets: list[list[Future[Target]]] = []
         self._backgrounds: list[Float[np.ndarray, "v 3"]] = []
@@ -37,16 +36,11 @@ class ViewBatch:
         """Return the number of views."""
         return sum(map(len, self._targets))
 
-    def request(self, frames: Iterable[tuple[str, int]]) -> int:
-        """Begin to load views of frames of named sequences; return how many."""
-        before = len(self)
-        for sequence, frame in frames:
-            self._targets.append(
-                self._loader.request(self._rng, sequence, frame, self._reduction, self._views)
-            )
-        added = len(self) - before
-        self._backgrounds.append(self._rng.random((added, 3), np.float32))
-        return added
+    def request(self, rng: np.random.Generator, sequence: str, frame: int) -> None:
+        """Begin to load views of a frame; cameras and backgrounds are drawn by chance."""
+        views = self._loader.request(rng, sequence, frame, self._reduction, self._views)
+        self._targets.append(views)
+        self._backgrounds.append(rng.random((len(views), 3), np.float32))
 
     def compare(
         self, gaussians: Sequence[Gaussians], config: LossConfig, lpips: torch.nn.Module | None

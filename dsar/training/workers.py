@@ -111,9 +111,20 @@ def collected(content: bytes) -> Iterator[tuple[int, bytes]]:
 
 def mean(value: float) -> float:
     """Return the mean of all workers' values, the same for all."""
+    return begin_mean(value)()
+
+
+def begin_mean(value: float) -> Callable[[], float]:
+    """Begin to exchange values; return what waits for them and gives their mean, the same for all workers."""
     shared = torch.tensor(value, dtype=torch.float64)
-    all_reduce([shared])
-    return float(shared) / world_size()
+    exchange = dist.all_reduce(shared, async_op=True) if dist.is_initialized() else None
+
+    def wait() -> float:
+        if exchange is not None:
+            exchange.wait()
+        return float(shared) / world_size()
+
+    return wait
 
 
 def all_reduce(tensors: Iterable[Tensor]) -> None:

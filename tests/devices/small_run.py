@@ -65,6 +65,7 @@ def small_config() -> TrainConfig:
             pretraining_fraction=0.25,
             pose_only_fraction=0.25,
             rollouts_per_worker=2,
+            template_frames_per_worker=2,
             chunk_frames=2,
         ),
     )
@@ -88,7 +89,6 @@ def few_of_everything() -> Iterator[None]:
     """Have training do less of all that it does many times, and report every update."""
     few = {
         "loop.REPORT_EVERY": 1,
-        "chunk.TEMPLATE_FRAMES": 2,
         "registration.STEPS": 2,
         "prior_fitting.GENERATIONS": 1,
         "prior_fitting.POPULATION": 4,

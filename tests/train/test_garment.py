@@ -14,6 +14,7 @@ from dsar.data.captures.formats import open_capture
 from dsar.evaluation.garment_metrics import measure_garment
 from dsar.raster import rasterize
 from dsar.training.chunk import ChunkTrainer
+from dsar.training.draws import Draws
 from dsar.training.kept_views import KeptViews
 from dsar.training.optimizers import set_rates
 from dsar.training.schedule import ScheduleState
@@ -108,11 +109,11 @@ def test_the_network_trains_with_the_whole_body_the_template_without_what_is_ben
     trainer = ChunkTrainer(config, KeptViews(capture), state, signals, None)
     hidden = avatar.texel_hidden.clone()
     Gradients(list(avatar.parameters())).clear()
-    trainer.backward_template(np.random.default_rng(0), 2)
+    trainer.backward_template(Draws(0, 0), 2)
     for name, parameter in avatar.template.named_parameters():
         assert parameter.grad[~hidden].any(), name
         assert not parameter.grad[hidden].any(), name
-    trainer.backward_chunk(np.random.default_rng(0), ScheduleState("autoregressive", 9, 2, 0.0, 0.0, 0.0))
+    trainer.backward_chunk(Draws(0, 0), ScheduleState("autoregressive", 9, 2, 0.0, 0.0, 0.0))
     assert not avatar.texel_hidden.any()
     assert avatar.template.opacity_logits[hidden].min() > 0
 
@@ -146,7 +147,7 @@ def test_one_fitted_frame_covers_the_mask(capture, sequence, frame):
         reduction, factor = (2, 1.0) if step < 50 else (1, 0.5)
         set_rates(state.optimizers, ScheduleState("template", 1, reduction, 0.0, 0.0, factor))
         gradients.clear()
-        trainer.backward_template(np.random.default_rng(step), reduction)
+        trainer.backward_template(Draws(0, step), reduction)
         state.optimizers["adam"].step()
     solid_recall, soft_recall = [], []
     with torch.no_grad():

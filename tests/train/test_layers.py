@@ -15,6 +15,7 @@ from dsar.geometry.harmonics import color_from_harmonics
 from dsar.network import NetworkOutput
 from dsar.raster.mesh import rasterize_mesh
 from dsar.training.chunk import ChunkTrainer
+from dsar.training.draws import Draws
 from dsar.training.kept_views import KeptViews
 from dsar.training.layers import FRAMES, Layers, _pixels_away
 from dsar.training.optimizers import keep_still, set_rates
@@ -184,7 +185,7 @@ def test_images_never_reach_fixed_texels_and_momentum_does_not_move_them(capture
     for seed in range(2):
         set_rates(state.optimizers, ScheduleState("template", 1, 2, 0.0, 0.0, 1.0))
         gradients.clear()
-        trainer.backward_template(np.random.default_rng(seed), 2)
+        trainer.backward_template(Draws(0, seed), 2)
         adam.step()
     maps = lifted_maps(avatar, -0.12)
     painted = paint(capture, garment_in(avatar, signals, maps))
@@ -195,7 +196,7 @@ def test_images_never_reach_fixed_texels_and_momentum_does_not_move_them(capture
     for seed in range(3):
         set_rates(state.optimizers, LATER)
         gradients.clear()
-        trainer.backward_chunk(np.random.default_rng(seed), LATER)
+        trainer.backward_chunk(Draws(0, seed), LATER)
         for name, parameter in avatar.template.named_parameters():
             assert not parameter.grad[fixed].any(), name
         adam.step()

@@ -14,6 +14,7 @@ from dsar.data.captures.formats import open_capture
 from dsar.evaluation.garment_metrics import distance_to_mesh
 from dsar.training import loop
 from dsar.training.chunk import ChunkTrainer
+from dsar.training.draws import Draws
 from dsar.training.kept_views import KeptViews
 from dsar.training.optimizers import set_rates
 from dsar.training.registered_maps import RegisteredMaps, divide_sequences
@@ -44,7 +45,7 @@ def registered():
     for step in range(60):
         set_rates(state.optimizers, schedule_at(config.schedule, 0.12 * step / 60))
         gradients.clear()
-        trainer.backward_template(np.random.default_rng([0, step]), 1)
+        trainer.backward_template(Draws(0, step), 1)
         state.optimizers["adam"].step()
     avatar.unhide_covered_texels()
     clips = {SEQUENCE: range(4, LAST + 1)}
@@ -179,7 +180,7 @@ def test_the_network_learns_to_follow_maps_that_lag_behind_the_motion(registered
     for step in range(60):
         set_rates(state.optimizers, schedule_at(config.schedule, 0.13 + 0.15 * step / 60))
         gradients.clear()
-        losses.append(trainer.backward_pretraining(np.random.default_rng([1, step])).loss)
+        losses.append(trainer.backward_pretraining(Draws(1, step)).loss)
         for optimizer in state.optimizers.values():
             optimizer.step()
     assert np.mean(losses[-10:]) < 0.5 * np.mean(losses[:10])

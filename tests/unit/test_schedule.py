@@ -52,7 +52,7 @@ def test_rollouts_restart_after_the_most_frames_and_at_the_end_of_a_clip():
     rollouts = RolloutBatch({"a": range(0, 10), "b": range(5, 8)}, 3)
     rng = np.random.default_rng(0)
     for _ in range(200):
-        cursors, fresh = rollouts.next_frames(rng, 4)
+        cursors, fresh = rollouts.next_frames([rng] * 3, 4)
         for cursor, restarted in zip(cursors, fresh, strict=True):
             assert cursor.frame in rollouts.clips[cursor.sequence]
             assert cursor.age < 4
@@ -65,7 +65,7 @@ def test_a_whole_clip_starts_at_its_first_frame_and_is_seen_to_its_end():
     rng = np.random.default_rng(0)
     seen = []
     for _ in range(14):
-        (cursor,), _ = rollouts.next_frames(rng, WHOLE_CLIP)
+        (cursor,), _ = rollouts.next_frames([rng], WHOLE_CLIP)
         seen.append(cursor.frame)
         rollouts.advance()
     # Only the very first start is anywhere, so that several rollouts are out of step.
