@@ -18,7 +18,7 @@ from dsar.evaluation.profiling import read_clock
 from dsar.network import DualStreamNetwork, build_network
 from dsar.network.reference import ReferenceNetwork, doubling_kernels
 from dsar.network.session import InferenceSession
-from dsar.training.budget import map_size
+from dsar.training.update_cost import map_size
 
 MOST_RUNS = 300
 WARM_UP = 8

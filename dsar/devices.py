@@ -51,4 +51,7 @@ def send(tensor: Tensor, device: torch.device) -> Tensor:
     """Return a tensor from main memory on a device; the host does not wait for what the device is doing."""
     if device.type == "cpu":
         return tensor
+    if device.type == "meta":
+        # Sizes alone, of which no memory is a part.
+        return tensor.to(device)
     return tensor.pin_memory().to(device, non_blocking=True)

@@ -37,10 +37,8 @@ def pose_gaussians(
     fields = [f.expand(batch, *f.shape[1:]) for f in (scales, opacities, harmonics)]
     if harmonics.shape[2] > 1:
         fields[2] = rotate_harmonics(fields[2], bone_rotations)
-    return [
-        Gaussians(posed_means[i], posed_rotations[i], fields[0][i], fields[1][i], fields[2][i])
-        for i in range(batch)
-    ]
+    parts = (field.unbind() for field in (posed_means, posed_rotations, *fields))
+    return [Gaussians(*own) for own in zip(*parts, strict=True)]
 
 
 def nearest_quaternions(matrices: Float[Tensor, "b n 3 3"]) -> Float[Tensor, "b n 4"]:

@@ -1,15 +1,19 @@
 """`dsar check`."""
 
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
 from dsar.cli.command import Common, file_stem
 from dsar.config import PRESETS
 from dsar.console import ProgressBar
+
+if TYPE_CHECKING:
+    from dsar.types import Camera
 
 _MINUTES = 60.0
 _SHEETS = Path("runs/check")
@@ -56,7 +60,7 @@ class Check(Common):
             rows,
             columns=columns,
         )
-        needs = self.estimate()
+        needs = self.estimate(capture.cameras)
         self.write_json(verdict.to_json() | {"sheet": str(sheet), "demo_preset": needs})
         for camera in verdict.cameras:
             shares = (
@@ -81,11 +85,16 @@ class Check(Common):
         if verdict.fatal:
             raise SystemExit(2)
 
-    def estimate(self) -> dict[str, Any]:
-        """Return what training with the demo's preset would need on this machine."""
-        from dsar.training.budget import estimate, measure_flops
+    def estimate(self, cameras: "Sequence[Camera]") -> dict[str, Any]:
+        """Return what training with the demo's preset would need on this machine, on whole images."""
+        import torch
+
+        from dsar.training.budget import estimate
+        from dsar.training.device_rates import measure_rates
 
         config = PRESETS["demo"]
-        budget = estimate(config)
-        seconds = budget.flop / measure_flops() * config.schedule.steps
+        view = max(camera.height for camera in cameras), max(camera.width for camera in cameras)
+        budget = estimate(config, view)
+        rate = measure_rates(torch.device("cpu")).convolution
+        seconds = budget.cost.network_flop / rate * config.schedule.steps
         return {"worker_bytes": budget.memory, "minutes_at_least": seconds / _MINUTES}

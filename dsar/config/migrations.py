@@ -25,7 +25,7 @@ RENAMED = {
     "schedule.clip": "schedule.max_gradient_norm",
 }
 """Old and new name of each setting, with its section."""
-ADDED = {"model.prior": "none", "loss.residual": 0.0}
+ADDED = {"model.prior": "none", "loss.residual": 0.0, "schedule.recomputation": "auto"}
 """Settings that came later, and the value by which runs from before go on as they were."""
 FORMER_DEFAULTS = ADDED | {"model.mean_time_constants": (0.1, 0.2, 0.4)}
 """What settings were when nobody gave them: a run from then goes on by the command that began it."""

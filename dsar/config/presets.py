@@ -12,6 +12,7 @@ PRESETS: dict[str, TrainConfig] = {
     ),
     "paper": TrainConfig(
         preset="paper",
+        workers=1,
         atlas=AtlasConfig(resolution=512, garment="off", weight_smoothing=0.0),
         model=ModelConfig(
             wiring="shared",

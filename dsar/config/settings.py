@@ -195,6 +195,10 @@ class ScheduleConfig:
     """Factor on the network's rates after pre-training."""
     max_gradient_norm: float = 1.0
     """Largest norm of the network's gradient."""
+    recomputation: Literal["auto", "on", "off"] = "auto"
+    """`on`: the network's activations are computed again on the way back instead of kept till then
+    (extension): a third more arithmetic, the same gradients, one frame's activations in memory instead of
+    those of `chunk_frames`; `auto`: where these would not fit."""
 
 
 @dataclass(frozen=True)

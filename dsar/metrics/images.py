@@ -27,16 +27,22 @@ def decibels(mse: Float[Tensor, ""] | float) -> float:
 
 def ssim(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
     """Return the mean structural similarity of two images in [0, 1] (Wang et al. 2004; 11x11 Gaussian)."""
-    x, y = image.permute(2, 0, 1), target.permute(2, 0, 1)
-    moments = torch.cat([x, y, x * x, y * y, x * y])
+    return ssim_map(image, target).mean()
+
+
+def ssim_map(
+    image: Float[Tensor, "*views h w 3"], target: Float[Tensor, "*views h w 3"]
+) -> Float[Tensor, "*views 3 h w"]:
+    """Return the structural similarity around each pixel; what is outside the image is zero."""
+    x, y = image.movedim(-1, -3), target.movedim(-1, -3)
+    moments = torch.cat([x, y, x * x, y * y, x * y], -3)
     # As two products with banded matrices, four times faster than single-channel convolutions.
-    rows, columns = (_blur_matrix(size, image.dtype, image.device) for size in image.shape[:2])
+    rows, columns = (_blur_matrix(size, image.dtype, image.device) for size in image.shape[-3:-1])
     moments = rows @ moments @ columns.mT
-    mx, my, mxx, myy, mxy = moments.chunk(5)
+    mx, my, mxx, myy, mxy = moments.chunk(5, -3)
     vx, vy, vxy = mxx - mx * mx, myy - my * my, mxy - mx * my
     c1, c2 = 0.01**2, 0.03**2
-    score = (2 * mx * my + c1) * (2 * vxy + c2) / ((mx * mx + my * my + c1) * (vx + vy + c2))
-    return score.mean()
+    return (2 * mx * my + c1) * (2 * vxy + c2) / ((mx * mx + my * my + c1) * (vx + vy + c2))
 
 
 @lru_cache(maxsize=512)

@@ -15,8 +15,10 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn.functional import leaky_relu
 
 from dsar.config import ModelConfig
+from dsar.network.layers import SLOPE, activate
 from dsar.network.pyramid import Pyramid
 
 
@@ -112,6 +114,9 @@ class SharedOffsetEncoder(WindowEncoder):
         """Return the features of all frames, encoded with the newest offsets."""
         sums = precomputed[0]
         if self.offset_channels:
-            sums = sums + self.pyramid.first_convolution(offsets, self.map_channels)[:, None]
-        features = self.pyramid.features(sums.flatten(0, 1))
+            # A new tensor, which is overwritten, so that not two of n frames are kept.
+            first = activate(sums + self.pyramid.first_convolution(offsets, self.map_channels)[:, None])
+        else:
+            first = leaky_relu(sums, SLOPE)
+        features = self.pyramid.features(first.flatten(0, 1))
         return WindowFeatures(tuple(x.unflatten(0, sums.shape[:2]) for x in features))

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
 
 from dsar.config import ModelConfig
 from dsar.network.decoder import ResidualDecoder
@@ -74,6 +75,8 @@ class DualStreamNetwork(nn.Module):
         self.bank = bank
         self.aggregation = nn.ModuleList(aggregation)
         self.decoder = decoder
+        self.recomputes = False
+        """Whether a step's activations are computed again on the way back, instead of kept till then."""
 
     @property
     def grid(self) -> tuple[int, int]:
@@ -116,6 +119,19 @@ class DualStreamNetwork(nn.Module):
         `magnitude` its standardised motion magnitude V. Without the stream `geometric` previous offsets
         count as zero, without `state` the bank holds the current aggregate only (stage 1 of the paper).
         """
+        if self.recomputes and torch.is_grad_enabled():
+            # Nothing here is random, and to keep the generator's state a GPU would be waited for.
+            given = maps, magnitude, state, streams
+            return checkpoint(self._step, *given, use_reentrant=False, preserve_rng_state=False)
+        return self._step(maps, magnitude, state, streams)
+
+    def _step(
+        self,
+        maps: Float[Tensor, "b c h w"],
+        magnitude: Float[Tensor, "b 1 h w"],
+        state: NetworkState,
+        streams: Collection[Stream],
+    ) -> tuple[NetworkOutput, NetworkState]:
         offsets = self.offset_input(state.offsets, streams)
         static = self.encoder.static_term()
         frame = self.encoder.encode_frame(self.unshuffle(maps), offsets, static)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from dsar.network.layers import SLOPE, ConvBlock, activate, channels_last, conv
+from dsar.network.layers import ConvBlock, activate, channels_last, conv
 
 
 def level_size(grid: tuple[int, int], level: int) -> tuple[int, int]:
@@ -43,10 +43,9 @@ class Pyramid(nn.Module):
         weight = self.first.weight[:, start : start + inputs.shape[1]]
         return nn.functional.conv2d(channels_last(inputs), weight, padding=1)
 
-    def features(self, sums: Float[Tensor, "b c h w"]) -> list[Float[Tensor, "b _ _ _"]]:
-        """Return the features f, finest level first, from the first convolution's sums."""
-        x = nn.functional.leaky_relu(sums, SLOPE)
-        features = [activate(self.second(x))]
+    def features(self, first: Float[Tensor, "b c h w"]) -> list[Float[Tensor, "b _ _ _"]]:
+        """Return the features f, finest level first, from the first convolution's, activated."""
+        features = [activate(self.second(first))]
         for block in self.deeper:
             features.append(block(features[-1]))
         return features

@@ -1,130 +1,126 @@
-"""What a run will need, estimated before it starts: memory of a worker and time of an update.
+"""What a run will need, said before it starts: memory and hours; and what would help where it does not fit.
 
-The network is run on torch's `meta` device, which computes sizes and no values. Posing, rasterising and
-image losses are not counted, so both are lower bounds; for the `paper` preset the network is most of it.
+The memory is what an update takes on torch's `meta` device (`dsar.training.update_cost`), and what a process
+and its libraries take besides. The hours are that update's operations at the rates of this device, which are
+measured.
 """
 
 import dataclasses
 import logging
-import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from torch import Tensor, nn
-from torch.utils.flop_counter import FlopCounterMode
 
-from dsar.config import TrainConfig
+from dsar.config import PRESETS, TrainConfig
 from dsar.errors import ConfigError
-from dsar.network import NetworkState, build_network
+from dsar.training.device_rates import measure_rates
+from dsar.training.launch import launched
+from dsar.training.update_cost import UpdateCost, cost_of_update
 
 _log = logging.getLogger(__name__)
-_BYTES_PER_PARAMETER = 16
-"""Weight, gradient and two moments."""
-_BASE = 600 * 2**20
+_PROCESS = 600 * 2**20
 """What a worker needs before it has a network: interpreter, torch, kernels, capture."""
-_PAST_OUTPUTS = 2
+_CONTEXT = 700 * 2**20
+"""What CUDA, cuBLAS, cuDNN and Warp take of a GPU (an estimate)."""
+_FRAGMENTS = 1.05
+"""What torch's allocator takes for what it is asked for (an estimate)."""
+_SAFE = 0.9
+"""Share of the free memory up to which activations are kept: it costs less to recompute than to run out."""
 _LONGEST_DAYS = 30
-_REPEATS = 10
+_GIB = 2**30
+
+View = tuple[int, int]
+"""Height and width of an image, pixels."""
 
 
 @dataclass(frozen=True)
 class Budget:
-    """What one worker needs for one update of the autoregressive stage."""
+    """What one worker needs."""
 
+    config: TrainConfig
+    """Its settings; whether the network recomputes is decided."""
     memory: int
     """Bytes, all in all."""
-    flop: int
-    """Floating-point operations of the network, forward and backward."""
-    parameters: int
-    """Of the network."""
-    seconds: float = 0.0
-    """What these operations take on this machine, in one thread; 0: not measured."""
+    cost: UpdateCost
+    """Of an update of the autoregressive stage."""
+    network_seconds: float = 0.0
+    """What the network takes of an update at least; 0: not measured."""
 
 
-def map_size(config: TrainConfig) -> tuple[int, int]:
-    """Return height and width of the network's maps; with a garment chart, if one may come."""
-    atlas = config.atlas
-    rows = atlas.resolution + atlas.garment_rows * (atlas.garment == "auto")
-    return rows // config.model.upsample, atlas.resolution // config.model.upsample
+@dataclass(frozen=True)
+class Room:
+    """Where a run is to fit: workers that share a device, and what else they keep there."""
+
+    device: torch.device
+    processes: int
+    """Workers on the device."""
+    images: int
+    """Bytes of decoded images that a worker keeps in main memory."""
+    view: View
+    """The largest view that is compared."""
+
+    def needed(self, budget: Budget) -> int:
+        """Return the bytes that all its workers take of the device."""
+        return (budget.memory + self.images * (self.device.type != "cuda")) * self.processes
 
 
-def estimate(config: TrainConfig) -> Budget:
-    """Return what the settings ask for."""
-    size, schedule = map_size(config), config.schedule
-    with torch.device("meta"):
-        network = build_network(config.model, torch.ones(size, dtype=torch.bool))
-        state = network.initial_state(schedule.rollouts_per_worker)
-        maps = torch.empty(schedule.rollouts_per_worker, config.model.map_channels, *size)
-        magnitude = torch.empty(schedule.rollouts_per_worker, 1, *size)
-    # The network looks at it, so it needs values.
-    state = dataclasses.replace(state, fresh=torch.zeros(schedule.rollouts_per_worker, dtype=torch.bool))
-    kept: list[Tensor] = []
-
-    def keep(tensor: Tensor) -> Tensor:
-        kept.append(tensor)
-        return tensor
-
-    hooks = torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor)
-    with FlopCounterMode(display=False) as counter, hooks:
-        loss, output = torch.zeros((), device="meta"), None
-        for _ in range(schedule.chunk_frames):
-            output, state = network(maps, magnitude, state)
-            loss = loss + output.offset.sum() + output.appearance.sum()
-        loss.backward()
-    assert output is not None
-    weights = {p.untyped_storage()._cdata for p in network.parameters()}
-    saved = {tensor.untyped_storage()._cdata: tensor.untyped_storage().nbytes() for tensor in kept}
-    activations = sum(size for storage, size in saved.items() if storage not in weights)
-    parameters = sum(p.numel() for p in network.parameters())
-    # A step makes the next state while the last is still there, and temporal losses look back two frames.
-    outputs = (output.offset, output.appearance, *output.features)
-    past = _PAST_OUTPUTS * sum(tensor.numel() * tensor.element_size() for tensor in outputs)
-    memory = _BASE + _BYTES_PER_PARAMETER * parameters + activations + 2 * _count_bytes(state) + past
-    return Budget(memory, counter.get_total_flops(), parameters)
+_Change = tuple[str, Callable[[TrainConfig, Room], tuple[TrainConfig, Room]]]
+"""Flags, and what they do."""
 
 
-def check_budget(
-    config: TrainConfig,
-    processes: int,
-    done: float = 0.0,
-    images: int = 0,
-    device: torch.device | None = None,
-) -> Budget:
-    """Return the estimate of a run that fits this machine.
+def estimate(config: TrainConfig, view: View, device: torch.device | None = None) -> Budget:
+    """Return what settings ask of a worker that compares views of a height and width in pixels.
+
+    A recomputation that is `auto` counts as off.
+    """
+    cost = cost_of_update(config, view)
+    if device is None or device.type != "cuda":
+        return Budget(config, _PROCESS + cost.total_memory, cost)
+    # A library may copy the operands of a convolution into the layout that its kernel likes.
+    workspace = max(o.traffic for o in cost.operations if o.arithmetic == "convolution")
+    return Budget(config, _CONTEXT + workspace + int(_FRAGMENTS * cost.total_memory), cost)
+
+
+def check_budget(config: TrainConfig, room: Room, done: float = 0.0) -> Budget:
+    """Return the estimate of a run that fits, with `schedule.recomputation` decided.
 
     Args:
         config: Its settings.
-        processes: Workers on this machine.
+        room: Where it is to fit.
         done: Share of the schedule that an earlier part of the run has done.
-        images: Bytes of decoded images that a worker keeps in main memory.
-        device: Where it computes; None: the CPU.
 
     Raises:
         ConfigError: it does not fit, with what to change.
     """
-    device = device or torch.device("cpu")
-    budget, memory = estimate(config), available_memory(device)
-    needed = (budget.memory + images * (device.type != "cuda")) * processes
-    where = f"preset {config.preset}, {processes} worker(s) on {device}"
-    if memory is not None and needed > memory:
+    free = available_memory(room.device)
+    budget = _decided(config, room, free)
+    where = f"preset {config.preset}, {room.processes} worker(s) on {room.device}"
+    if free is not None and room.needed(budget) > free:
         raise ConfigError(
-            f"training ({where}) needs about {needed / 2**30:.1f} GiB, {memory / 2**30:.1f} GiB are free; "
-            f"most are activations of {config.schedule.chunk_frames} frame(s) of "
-            f"{config.schedule.rollouts_per_worker} rollout(s): lower --schedule.chunk-frames, "
-            "--schedule.rollouts-per-worker or --workers, or take --model.wiring perframe or --preset small"
+            f"training ({where}) needs about {room.needed(budget) / _GIB:.1f} GiB, {free / _GIB:.1f} GiB are "
+            f"free; most is for {_largest_parts(budget.cost)}. {_advice(config, room, free)}"
         )
-    seconds = budget.flop / measure_flops(device)
+    rates = measure_rates(room.device)
+    network_seconds = budget.cost.network_flop / rates.convolution
+    seconds = network_seconds if room.device.type == "cpu" else rates.seconds(budget.cost.operations)
     # The template's updates do not run the network.
     share = min(1 - done, 1 - config.schedule.template_fraction)
-    days = seconds * share * config.schedule.steps / 86400
-    if config.schedule.minutes is None and days > _LONGEST_DAYS:
+    hours = seconds * share * config.schedule.steps / 3600
+    if config.schedule.minutes is None and hours > 24 * _LONGEST_DAYS:
         raise ConfigError(
-            f"training ({where}) would take {days:.0f} days or more: {config.schedule.steps} updates, most "
-            f"of at least {seconds:.1f} s; give --minutes or --steps, or take --preset small"
+            f"training ({where}) would take {hours / 24:.0f} days or more: {config.schedule.steps} updates, "
+            f"most of at least {seconds:.1f} s; give --minutes or --steps, or take --preset small"
         )
-    _log.info("An update needs %.1f s or more, a worker %.1f GiB", seconds, budget.memory / 2**30)
-    return dataclasses.replace(budget, seconds=seconds)
+    _log.info(
+        "A worker needs about %.1f GiB%s, an update %.2f s or more, the run %.1f hours or more",
+        budget.memory / _GIB,
+        f" of {free / _GIB:.1f} that are free" if free is not None else "",
+        seconds,
+        hours,
+    )
+    return dataclasses.replace(budget, network_seconds=network_seconds)
 
 
 def available_memory(device: torch.device | None = None) -> int | None:
@@ -145,32 +141,89 @@ def available_memory(device: torch.device | None = None) -> int | None:
     return min(limits, default=None)
 
 
-def measure_flops(device: torch.device | None = None) -> float:
-    """Return the floating-point operations a second of a convolution like the network's, in one thread."""
-    layer, x = nn.Conv2d(64, 64, 3, padding=1).to(device), torch.rand(4, 64, 64, 64, device=device)
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
+def _decided(config: TrainConfig, room: Room, free: int | None) -> Budget:
+    """Return the estimate with a recomputation that is `auto` switched on where it is needed, else off."""
+    if config.schedule.recomputation != "auto":
+        return estimate(config, room.view, room.device)
+    kept = estimate(_with(config, "schedule", recomputation="off"), room.view, room.device)
+    if free is None or room.needed(kept) <= _SAFE * free:
+        return kept
+    again = estimate(_with(config, "schedule", recomputation="on"), room.view, room.device)
+    _log.info(
+        "With activations kept, training needs %.1f GiB of %.1f that are free: they are computed again on "
+        "the way back, which takes %.1f GiB and more time (--schedule.recomputation)",
+        room.needed(kept) / _GIB,
+        free / _GIB,
+        room.needed(again) / _GIB,
+    )
+    return again
+
+
+def _largest_parts(cost: UpdateCost) -> str:
+    """Return the three largest parts of the memory, in words."""
+    parts = sorted(cost.memory.items(), key=lambda item: -item[1])[:3]
+    return ", ".join(f"{name} ({size / _GIB:.1f})" for name, size in parts)
+
+
+def _advice(config: TrainConfig, room: Room, free: int) -> str:
+    """Return which flags make a run fit, each by itself or else together, and what it needs with them."""
+    if config.schedule.recomputation == "auto":
+        config = _with(config, "schedule", recomputation="on")
+    found, together, strongest = [], [], (config, room)
+    for changes in _changes(config, room):
+        for flag, change in changes:
+            if (needed := _needed(*change(config, room))) <= free:
+                found.append(f"{flag} ({needed / _GIB:.1f} GiB)")
+                break
+        flag, change = changes[-1]
+        together, strongest = [*together, flag], change(*strongest)
+        if not found and len(together) > 1 and (needed := _needed(*strongest)) <= free:
+            found.append(f"{' '.join(together)} ({needed / _GIB:.1f} GiB)")
+            break
+    if not found and (needed := _needed(PRESETS["small"], room)) <= free:
+        found.append(f"--preset small ({needed / _GIB:.1f} GiB)")
+    return f"What fits: {', or '.join(found)}" if found else "No setting makes it fit: take another device"
+
+
+def _changes(config: TrainConfig, room: Room) -> Iterator[list[_Change]]:
+    """Yield, by setting, the changes that make a run smaller, the mildest first."""
+    schedule = config.schedule
+    if schedule.recomputation == "off":
+        yield [_setting("schedule", "recomputation", "on")]
+    if room.processes > 1:
+        flag = "--workers 1" if launched() is None else "--nproc-per-node 1 of torchrun"
+        yield [(flag, lambda config, room: (config, dataclasses.replace(room, processes=1)))]
+    for name in ("rollouts_per_worker", "views", "chunk_frames"):
+        if changes := [_setting("schedule", name, value) for value in _halves(getattr(schedule, name))]:
+            yield changes
+    resolutions = (_setting("atlas", "resolution", value) for value in _halves(config.atlas.resolution))
+    if changes := [change for change in resolutions if _is_valid(change[1](config, room)[0])]:
+        yield changes
+
+
+def _setting(section: str, name: str, value: object) -> _Change:
+    flag = f"--{section}.{name.replace('_', '-')} {value}"
+    return flag, lambda config, room: (_with(config, section, **{name: value}), room)
+
+
+def _is_valid(config: TrainConfig) -> bool:
     try:
-        with torch.no_grad():
-            y = layer(x)
-            y[0, 0, 0, 0].item()
-            start = time.perf_counter()
-            for _ in range(_REPEATS):
-                y = layer(x)
-            # Read, for a GPU works behind the host's back.
-            y[0, 0, 0, 0].item()
-            seconds = time.perf_counter() - start
-    finally:
-        torch.set_num_threads(threads)
-    return _REPEATS * 2 * 9 * 64**2 * x.numel() / 64 / seconds
+        config.validate()
+    except ConfigError:
+        return False
+    return True
 
 
-def _count_bytes(state: NetworkState) -> int:
-    sizes: list[int] = []
+def _halves(count: int) -> Iterator[int]:
+    while count > 1:
+        count //= 2
+        yield count
 
-    def add(tensor: Tensor) -> Tensor:
-        sizes.append(tensor.numel() * tensor.element_size())
-        return tensor
 
-    state.map(add)
-    return sum(sizes)
+def _needed(config: TrainConfig, room: Room) -> int:
+    return room.needed(estimate(config, room.view, room.device))
+
+
+def _with(config: TrainConfig, section: str, **values: object) -> TrainConfig:
+    """Return settings with others in a section."""
+    return dataclasses.replace(config, **{section: dataclasses.replace(getattr(config, section), **values)})

@@ -5,7 +5,6 @@ import math
 import os
 from collections import defaultdict
 from collections.abc import Collection, Mapping
-from concurrent.futures import Future
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,17 +17,17 @@ from dsar.config import TrainConfig
 from dsar.devices import send
 from dsar.errors import TrainingError
 from dsar.network import STREAMS, NetworkOutput, Stream
-from dsar.raster import rasterize, reduced_dilation
 from dsar.training import workers
 from dsar.training.driving_maps import DrivingFrames, DrivingMaps
 from dsar.training.kept_views import KeptViews
-from dsar.training.losses import CENTIMETRES, image_loss, registered_loss, spatial_loss
+from dsar.training.losses import CENTIMETRES, registered_loss, spatial_loss
 from dsar.training.report import UpdateMetrics
 from dsar.training.rollouts import RolloutCursor
 from dsar.training.schedule import WHOLE_CLIP, ScheduleState
 from dsar.training.state import TrainingState
-from dsar.training.targets import Target, TargetLoader
+from dsar.training.targets import TargetLoader
 from dsar.training.temporal_losses import TemporalRecord, temporal_losses
+from dsar.training.view_batch import ViewBatch
 from dsar.types import Gaussians
 
 TEMPLATE_FRAMES = 8
@@ -73,7 +72,7 @@ class ChunkTrainer:
         self.lpips = lpips
         avatar, self.device = state.avatar, state.avatar.device
         threads = max(1, (os.cpu_count() or 1) // workers.local_count(config.workers))
-        self.loader = TargetLoader(views, self.device, threads)
+        self.loader = TargetLoader(views, threads)
         self._shown = False
         self.mirror = Mirror(avatar.control) if config.schedule.mirrored_fraction else None
         self.drive(signals)
@@ -85,18 +84,15 @@ class ChunkTrainer:
 
     def backward_template(self, rng: np.random.Generator, reduction: int) -> UpdateMetrics:
         """Back-propagate views of the template in the shapes it has in still frames."""
-        rest = self.state.rest
-        chosen, views = rng.choice(len(rest.frames), TEMPLATE_FRAMES), self.config.schedule.views
+        rest, views = self.state.rest, self._view_batch(rng, reduction)
+        chosen = rng.choice(len(rest.frames), TEMPLATE_FRAMES)
         frames = [rest.frames[index] for index in chosen]
-        targets = [self.loader.request(rng, name, frame, reduction, views) for name, frame in frames]
-        count = max(sum(map(len, targets)), 1)
-        loss, mse = count * rest.loss(self.avatar, self.config.loss), self._zero()
-        for index, (name, frame), frame_targets in zip(chosen, frames, targets, strict=True):
-            output = rest.output(self.avatar, int(index))
-            gaussians = self.avatar.gaussians(self.signals[name].windows[frame : frame + 1], output)[0]
-            view = self._views(rng, gaussians, frame_targets, reduction)
-            loss, mse = loss + view[0], mse + view[1]
-        return self._backward(loss, mse, count)
+        count = max(views.request(frames), 1)
+        windows = torch.stack([self.signals[name].windows[frame, :1] for name, frame in frames])
+        outputs = rest.output(self.avatar, send(torch.from_numpy(chosen), self.device))
+        gaussians = self.avatar.gaussians(windows, outputs)
+        loss, mse = views.compare(gaussians, self.config.loss, self.lpips)
+        return self._backward(loss + count * rest.loss(self.avatar, self.config.loss), mse, count)
 
     def backward_pretraining(self, rng: np.random.Generator) -> UpdateMetrics:
         """Step every rollout by K frames and back-propagate the distance to the registered maps."""
@@ -120,27 +116,19 @@ class ChunkTrainer:
         schedule = self.config.schedule
         streams = STREAMS if schedule_state.stage == "autoregressive" else ()
         losses: dict[str, Tensor] = defaultdict(self._zero)
-        mse, count = self._zero(), 0
+        views, gaussians = self._view_batch(rng, schedule_state.reduction), list[Gaussians]()
         for _ in range(schedule.chunk_frames):
             cursors, fresh = self.state.rollouts.next_frames(rng, schedule_state.max_rollout_frames)
             rendered = [i for i in range(len(cursors)) if rng.random() < schedule.rendered_fraction]
-            targets = [
-                self.loader.request(
-                    rng, cursors[i].sequence, cursors[i].frame, schedule_state.reduction, schedule.views
-                )
-                for i in rendered
-            ]
+            added = views.request((cursors[i].sequence, cursors[i].frame) for i in rendered)
             step = self._step(cursors, fresh, streams=streams)
-            batch = self._pose(step, rendered) if rendered else []
-            for gaussians, frame_targets in zip(batch, targets, strict=True):
-                view = self._views(rng, gaussians, frame_targets, schedule_state.reduction)
-                losses["render"] = losses["render"] + view[0]
-                mse, count = mse + view[1], count + len(frame_targets)
+            gaussians += self._pose(step, rendered) if rendered else []
             for name, loss in self._regularizers(step, streams).items():
-                losses[name] = losses[name] + loss * sum(map(len, targets))
+                losses[name] = losses[name] + loss * added
         self._detach_state()
+        losses["render"], mse = views.compare(gaussians, self.config.loss, self.lpips)
         gradients = self._compare_gradients(losses) if probe else None
-        metrics = self._backward(torch.stack(list(losses.values())).sum(), mse, max(count, 1))
+        metrics = self._backward(torch.stack(list(losses.values())).sum(), mse, max(len(views), 1))
         return dataclasses.replace(metrics, gradients=gradients)
 
     def _show_whole_body(self) -> None:
@@ -176,19 +164,8 @@ class ChunkTrainer:
         self.state.network = self.state.network.detach()
         self.state.history.detach()
 
-    def _views(
-        self, rng: np.random.Generator, gaussians: Gaussians, targets: list[Future[Target]], reduction: int
-    ) -> tuple[Tensor, Tensor]:
-        """Return summed loss and squared error of some views on a random background."""
-        loss, mse = self._zero(), self._zero()
-        for target in (future.result() for future in targets):
-            background = send(torch.from_numpy(rng.random(3, np.float32)), self.device)
-            output = rasterize(
-                gaussians, target.camera, background=background, dilation=reduced_dilation(reduction)
-            )
-            view_loss, view_mse = image_loss(output, target, background, self.config.loss, self.lpips)
-            loss, mse = loss + view_loss, mse + view_mse
-        return loss, mse
+    def _view_batch(self, rng: np.random.Generator, reduction: int) -> ViewBatch:
+        return ViewBatch(self.loader, rng, reduction, self.config.schedule.views)
 
     def _regularizers(self, step: _Step, streams: Collection[Stream]) -> dict[str, Tensor]:
         """Return the weighted losses of a frame that need no image, by name."""

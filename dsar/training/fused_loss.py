@@ -1,7 +1,7 @@
-"""The image losses of `losses.py`, value and gradient together in compiled loops.
+"""The image losses of `padded_images.py`, of one image, value and gradient together in compiled loops.
 
 A training image is so small that as tensor operations its losses cost as much as rendering it. The plain
-functions in `losses.py` say what is computed, and judge this one in its tests.
+function in `padded_images.py` says what is computed, and judges this one in its tests.
 """
 
 from typing import Any

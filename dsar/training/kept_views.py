@@ -16,6 +16,8 @@ from dsar.types import Capture
 
 CAPACITY = 1 << 28
 """Bytes of images that a worker keeps."""
+_SAMPLES = 16
+"""Images that say how large the person is in others."""
 
 
 @dataclass(frozen=True)
@@ -80,6 +82,22 @@ def kept_bytes(capture: Capture) -> int:
     pixels = sum(camera.width * camera.height for camera in capture.cameras)
     frames = sum(len(capture.motions[name]) for name in capture.splits["train"])
     return min(CAPACITY, 4 * pixels * frames)
+
+
+def largest_crop(capture: Capture, margin: int) -> tuple[int, int]:
+    """Return height and width, pixels, that hold the person with a margin in each of a few training images.
+
+    They are spread over frames and cameras. Without an image it is one of the margin alone.
+    """
+    frames = [(name, k) for name in capture.splits["train"] for k in range(len(capture.motions[name]))]
+    height, width = 2 * margin, 2 * margin
+    for turn, place in enumerate(range(0, len(frames), -(-len(frames) // _SAMPLES))):
+        name, frame = frames[place]
+        if cameras := capture.cameras_with_image(name, frame):
+            alpha = capture.image(name, frame, cameras[turn % len(cameras)])[..., 3]
+            x0, y0, x1, y1 = mask_box(alpha, margin)
+            height, width = max(height, y1 - y0), max(width, x1 - x0)
+    return height, width
 
 
 @kernel

@@ -18,10 +18,10 @@ from dsar.data.captures.formats import capture_of
 from dsar.errors import CaptureError, CheckpointError, ConfigError, TrainingError
 from dsar.metrics.lpips import load_lpips
 from dsar.training import launch, workers
-from dsar.training.budget import check_budget
+from dsar.training.budget import Room, check_budget
 from dsar.training.checkpoint import Run, check_files, load_checkpoint, read_config, read_progress
 from dsar.training.chunk import ChunkTrainer
-from dsar.training.kept_views import KeptViews, kept_bytes
+from dsar.training.kept_views import KeptViews, kept_bytes, largest_crop
 from dsar.training.layers import Layers
 from dsar.training.optimizers import keep_still, set_rates
 from dsar.training.pace import Clock, leave, stop_signals
@@ -39,6 +39,7 @@ from dsar.training.scene import scene_of_capture, write_scene
 from dsar.training.schedule import ScheduleState, schedule_at, without_pretraining
 from dsar.training.state import TrainingState
 from dsar.training.state_files import read_checkpoint, write_checkpoint
+from dsar.training.targets import MARGIN
 from dsar.training.time_limit import TimeLimit, part_at
 from dsar.types import Capture
 
@@ -89,7 +90,8 @@ def _prepare(
     """Check all that is asked for, and write down the settings and the scene of the run.
 
     Returns:
-        The settings for the workers that there are, and the seconds that an update's network takes at least.
+        The settings for the workers that there are, with what they recompute decided, and the seconds that an
+        update's network takes at least.
     """
     config.validate()
     if run.checkpoint.exists() and not resume:
@@ -116,12 +118,12 @@ def _prepare(
     else:
         divided = config
     done = read_progress(run).progress if resume else 0.0
-    images = capture.kept_bytes + kept_bytes(capture)
+    images, view = capture.kept_bytes + kept_bytes(capture), largest_crop(capture, MARGIN)
     sharing = 1 if device.type == "cuda" and launch.launched() else workers.local_count(divided.workers)
-    budget = check_budget(divided, sharing, done, images, device)
+    budget = check_budget(divided, Room(device, sharing, images, view), done)
     write_scene(run.scene, scene_of_capture(whole))
     write_text_atomically(run.config, config_to_json(config))
-    return divided, budget.seconds
+    return budget.config, budget.network_seconds
 
 
 def _train(
@@ -139,6 +141,7 @@ def _train(
         avatar, _, _ = load_checkpoint(run, device)
     else:
         avatar = Avatar.from_capture(capture, capture.body, config.atlas, config.model).to(device)
+    avatar.network.recomputes = config.schedule.recomputation == "on"
     lpips = load_lpips("alex").to(device) if config.loss.lpips else None
     clips = training_clips(capture)
     signals = {name: avatar.driving_signal(capture.motions[name]) for name in clips}

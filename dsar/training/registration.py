@@ -20,9 +20,10 @@ from dsar.body.skinning import blend_transforms
 from dsar.config import TrainConfig
 from dsar.devices import send
 from dsar.geometry.cameras import project
-from dsar.raster import rasterize, reduced_dilation
+from dsar.raster import rasterize_views, reduced_dilation
+from dsar.training.image_losses import image_losses
 from dsar.training.kept_views import KeptViews
-from dsar.training.losses import image_loss, spatial_loss
+from dsar.training.losses import spatial_loss
 from dsar.training.registered_maps import RegisteredMaps
 from dsar.training.report import UpdateMetrics
 from dsar.training.rest import RestOffsets
@@ -169,14 +170,17 @@ class Registration:
         """Return loss and squared error of views over a background, and how far neighbours part."""
         gaussians = self.avatar.gaussians(motion_window, self.avatar.offset_garment(offset[None]))[0]
         color = send(torch.from_numpy(background.astype(np.float32)), offset.device)
-        loss, mse = offset.new_zeros(()), offset.new_zeros(())
-        for target, weight in views:
-            output = rasterize(
-                gaussians, target.camera, background=color, dilation=reduced_dilation(REDUCTION)
-            )
-            view_loss, error = image_loss(output, target, color, self.loss, None)
-            loss, mse = loss + weight * view_loss / len(views), mse + error / len(views)
-        return loss + ROUGHNESS * self._roughness(offset), mse
+        targets, weights = [target for target, _ in views], torch.tensor([weight for _, weight in views])
+        backgrounds = color.expand(len(views), 3)
+        drawn = rasterize_views(
+            [gaussians],
+            [[target.camera for target in targets]],
+            backgrounds=backgrounds,
+            dilation=reduced_dilation(REDUCTION),
+        )
+        losses, errors = image_losses(drawn[0], targets, backgrounds, self.loss, None)
+        loss = (losses * send(weights, offset.device)).mean()
+        return loss + ROUGHNESS * self._roughness(offset), errors.mean()
 
     def _roughness(self, offset: Float[Tensor, "g 3"]) -> Float[Tensor, ""]:
         return spatial_loss(self.avatar.scatter_garment_points(offset[None]), self.avatar.control.edges)
@@ -194,7 +198,7 @@ class Registration:
         x1, y1 = min(max(int(high[0]), x0 + 1), width), min(max(int(high[1]), y0 + 1), height)
         color, alpha = target.color[y0:y1, x0:x1].contiguous(), target.alpha[y0:y1, x0:x1].contiguous()
         part = Target(color, alpha, target.camera.cropped(x0, y0, x1 - x0, y1 - y0))
-        return part.to(self.avatar.device), alpha.numel() / target.alpha.numel()
+        return part, alpha.numel() / target.alpha.numel()
 
     def _posed(self, motion_window: Tensor, offset: Float[Tensor, "g 3"]) -> Float[Tensor, "g 3"]:
         """Return where the garment's control points are in the world."""

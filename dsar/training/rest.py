@@ -6,7 +6,7 @@ blur what they differ in; so each of them has offsets of its own, and the templa
 """
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
 from dsar.avatar.avatar import Avatar
@@ -34,9 +34,9 @@ class RestOffsets(nn.Module):
         cells = avatar.texels[self._garment]
         self._edges = find_surface_edges(cells, avatar.atlas_size, self._chart, avatar.charts)
 
-    def output(self, avatar: Avatar, index: int) -> NetworkOutput:
-        """Return the output that gives the garment the shape it has in one of the frames."""
-        return avatar.offset_garment(self.offsets[index : index + 1])
+    def output(self, avatar: Avatar, frames: Int64[Tensor, " b"]) -> NetworkOutput:
+        """Return the output that gives the garment the shapes it has in some of the frames."""
+        return avatar.offset_garment(self.offsets.index_select(0, frames))
 
     def earliest(self, sequence: str) -> Float[Tensor, "g 3"]:
         """Return the offsets in the earliest still frame of a sequence, zeros if it has none."""

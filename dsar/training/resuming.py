@@ -45,10 +45,13 @@ def with_former_defaults(config: TrainConfig, saved: TrainConfig) -> TrainConfig
 
 
 def check_same_settings(config: TrainConfig, saved: TrainConfig, run: Run) -> None:
-    """Raise ConfigError where a resumed run would change a setting other than its length and its workers."""
+    """Raise ConfigError where a resumed run would change a setting that its result depends on.
+
+    Its length and its workers may be others, and what it recomputes.
+    """
     saved = dataclasses.replace(saved, workers=config.workers)
-    length = {"steps": config.schedule.steps, "minutes": config.schedule.minutes}
-    saved = dataclasses.replace(saved, schedule=dataclasses.replace(saved.schedule, **length))
+    free = {name: getattr(config.schedule, name) for name in ("steps", "minutes", "recomputation")}
+    saved = dataclasses.replace(saved, schedule=dataclasses.replace(saved.schedule, **free))
     given, recorded = dataclasses.asdict(config), dataclasses.asdict(saved)
     changed = sorted(key for key in given if given[key] != recorded[key])
     if changed:

@@ -9,7 +9,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dsar.devices import send
 from dsar.metrics.images import with_margin
 from dsar.training.kept_views import KeptViews
 from dsar.types import Camera
@@ -20,7 +19,7 @@ MARGIN = 6
 
 @dataclass(frozen=True)
 class Target:
-    """One view to be matched."""
+    """One view to be matched, in main memory."""
 
     color: Float[Tensor, "h w 3"]
     """Display-referred sRGB in [0, 1], premultiplied by alpha."""
@@ -28,10 +27,6 @@ class Target:
     """The mask in [0, 1]."""
     camera: Camera
     """The camera of exactly these pixels."""
-
-    def to(self, device: torch.device) -> "Target":
-        """Return the same on a device."""
-        return Target(send(self.color, device), send(self.alpha, device), self.camera)
 
 
 def load_target(views: KeptViews, sequence: str, frame: int, camera_index: int, reduction: int) -> Target:
@@ -55,8 +50,8 @@ def load_target(views: KeptViews, sequence: str, frame: int, camera_index: int, 
 class TargetLoader:
     """Loads views in threads of its own, while the network computes."""
 
-    def __init__(self, views: KeptViews, device: torch.device, threads: int = 1) -> None:
-        self.views, self.device = views, device
+    def __init__(self, views: KeptViews, threads: int = 1) -> None:
+        self.views = views
         self._threads = ThreadPoolExecutor(threads, "targets")
 
     def request(
@@ -65,7 +60,5 @@ class TargetLoader:
         """Begin to load some of the views of a frame, as many as there are at most."""
         cameras = self.views.capture.cameras_with_image(sequence, frame)
         chosen = rng.choice(cameras, min(count, len(cameras)), replace=False) if cameras else ()
-        return [self._threads.submit(self._load, sequence, frame, int(index), reduction) for index in chosen]
-
-    def _load(self, sequence: str, frame: int, camera: int, reduction: int) -> Target:
-        return load_target(self.views, sequence, frame, camera, reduction).to(self.device)
+        submit = self._threads.submit
+        return [submit(load_target, self.views, sequence, frame, int(k), reduction) for k in chosen]

@@ -70,6 +70,19 @@ def small_config() -> TrainConfig:
     )
 
 
+def default_config() -> TrainConfig:
+    """Return the default settings of network, losses and batch, with narrow maps and as few updates."""
+    small, config = small_config(), TrainConfig(workers=1)
+    return dataclasses.replace(
+        config,
+        atlas=small.atlas,
+        model=dataclasses.replace(config.model, channels=(4, 4, 8), heads=2, upsample=4),
+        schedule=dataclasses.replace(
+            config.schedule, steps=STEPS, template_fraction=0.25, pretraining_fraction=0.25
+        ),
+    )
+
+
 @contextmanager
 def few_of_everything() -> Iterator[None]:
     """Have training do less of all that it does many times, and report every update."""
@@ -95,8 +108,9 @@ def train_small(
     *,
     stop_after: int = STEPS,
     resume: bool = False,
+    config: TrainConfig | None = None,
 ) -> Run:
-    """Train the small run, up to an update; return its folder."""
+    """Train the small run, or one of other settings, up to an update; return its folder."""
 
     def listen(line: Report) -> None:
         report(line)
@@ -105,6 +119,8 @@ def train_small(
 
     with few_of_everything():
         try:
-            return loop.train(small_config(), Run(folder), resume=resume, report=listen, device=device)
+            return loop.train(
+                config or small_config(), Run(folder), resume=resume, report=listen, device=device
+            )
         except KeyboardInterrupt:
             return Run(folder)

@@ -151,7 +151,7 @@ def test_one_fitted_frame_covers_the_mask(capture, sequence, frame):
     solid_recall, soft_recall = [], []
     with torch.no_grad():
         gaussians = avatar.gaussians(
-            trainer.signals[sequence].windows[[frame]], state.rest.output(avatar, 0)
+            trainer.signals[sequence].windows[[frame]], state.rest.output(avatar, torch.tensor([0]))
         )[0]
         for index, camera in enumerate(capture.cameras):
             truth = torch.tensor(capture.image(sequence, frame, index)[..., 3]) / 255

@@ -80,11 +80,11 @@ def test_the_template_finds_the_cloth_and_every_still_frame_has_folds_of_its_own
         for here, there in itertools.permutations(
             [begins[name] for name in ("sway", "walk", "turn_about")], 2
         ):
-            points, cloth = posed(here, rest.output(avatar, here))
+            points, cloth = posed(here, rest.output(avatar, torch.tensor([here])))
             distances.append(distance_to_mesh(points, cloth, faces))
             spots = cloth[faces].mean(1)
             nearest = torch.cdist(points, spots).argmin(1)
-            moved, other = posed(there, rest.output(avatar, there))
+            moved, other = posed(there, rest.output(avatar, torch.tensor([there])))
             carried = other[faces].mean(1)[nearest] - spots[nearest]
             own.append((moved - points - carried).norm(dim=1))
             shared.append((posed(there, None)[0] - posed(here, None)[0] - carried).norm(dim=1))

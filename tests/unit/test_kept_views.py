@@ -5,7 +5,7 @@ import pytest
 
 from dsar.data.captures.formats import open_capture
 from dsar.metrics.images import mask_box, with_margin
-from dsar.training.kept_views import KeptViews, PackedView
+from dsar.training.kept_views import KeptViews, PackedView, largest_crop
 
 
 def plain_means(image, x0, y0, x1, y1, n):
@@ -72,3 +72,16 @@ def test_a_kept_view_is_read_once_and_none_makes_room_for_another(monkeypatch):
         views.read(*second)
     assert reads == [first, second, second]
     assert views.used == size
+
+
+def test_the_largest_crop_holds_the_person_in_the_images_that_were_looked_at():
+    capture = open_capture("embedded", train_frames="0-3")
+    height, width = largest_crop(capture, 6)
+    boxes = []
+    for name in capture.splits["train"]:
+        for frame in range(len(capture.motions[name])):
+            for camera in capture.cameras_with_image(name, frame):
+                x0, y0, x1, y1 = mask_box(capture.image(name, frame, camera)[..., 3], 6)
+                boxes.append((y1 - y0, x1 - x0))
+    assert 0.8 * max(h for h, _ in boxes) <= height <= max(h for h, _ in boxes)
+    assert 0.6 * max(w for _, w in boxes) <= width <= max(w for _, w in boxes)

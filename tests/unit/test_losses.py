@@ -1,18 +1,11 @@
 """Losses against independent implementations and their own definitions."""
 
 import numpy as np
-import pytest
 import torch
 from scipy.ndimage import gaussian_filter
 
 from dsar.metrics.images import ssim
-from dsar.training.fused_loss import fused_image_loss
-from dsar.training.losses import (
-    plain_image_loss,
-    pyramid_l1,
-    registered_loss,
-    spatial_loss,
-)
+from dsar.training.losses import registered_loss, spatial_loss
 
 
 def images(seed=0, size=(40, 33)):
@@ -37,17 +30,6 @@ def test_ssim_equals_its_published_definition():
     assert abs(float(ssim(a, a)) - 1) < 1e-6
 
 
-def test_pyramid_sees_a_shift_that_plain_l1_cannot_order():
-    stripes = (torch.arange(64) // 4 % 2).float()[None, :, None].expand(64, 64, 3)
-    near = torch.roll(stripes, 1, 1)
-    blank = torch.full_like(stripes, 0.5)
-    assert pyramid_l1(stripes, stripes, 4) == 0
-    assert pyramid_l1(near, stripes, 1) == (near - stripes).abs().mean()
-    far = torch.roll(stripes, 4, 1)
-    assert pyramid_l1(far, stripes, 1) > pyramid_l1(near, stripes, 1)
-    assert pyramid_l1(blank, stripes, 4) < pyramid_l1(blank, stripes, 1)
-
-
 def test_spatial_loss_counts_a_centimetre_between_neighbours_as_one():
     offsets, edges = torch.full((2, 3, 3), 0.2), torch.tensor([[0, 1], [1, 2]])
     assert spatial_loss(offsets, edges) == 0
@@ -55,21 +37,6 @@ def test_spatial_loss_counts_a_centimetre_between_neighbours_as_one():
     # One link of two, in one rollout of two.
     assert abs(float(spatial_loss(offsets, edges)) - 0.25) < 1e-5
     assert spatial_loss(offsets, edges[:0]) == 0
-
-
-@pytest.mark.parametrize("size", [(37, 22), (64, 48), (7, 5)])
-@pytest.mark.parametrize("weights", [(1.0, 0.1, 0.3), (0.5, 0.0, 0.0), (0.0, 1.0, 0.0)])
-def test_fused_losses_equal_the_plain_ones_in_value_and_gradient(size, weights):
-    generator = torch.Generator().manual_seed(3)
-    truth, mask = torch.rand(*size, 3, generator=generator), torch.rand(*size, generator=generator)
-    color = (truth + 0.3 * torch.randn(*size, 3, generator=generator)).requires_grad_()
-    alpha = torch.rand(*size, generator=generator).requires_grad_()
-    results = []
-    for compare in (plain_image_loss, fused_image_loss):
-        loss = compare(color, alpha, truth, mask, 4, weights)
-        results.append([loss, *torch.autograd.grad(3 * loss, (color, alpha))])
-    for plain, fused in zip(*results, strict=True):
-        assert torch.allclose(plain, fused, rtol=1e-4, atol=1e-6 * float(plain.detach().abs().max()) + 1e-9)
 
 
 def test_distance_to_registered_maps_is_in_centimetres():

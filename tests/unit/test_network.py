@@ -175,3 +175,24 @@ def test_rows_that_see_the_future_differ_from_causal_ones():
     free = dataclasses.replace(causal, causal=False)
     outputs = [roll(build(config), *inputs(SMALL, 8))[0][-1].offset for config in (causal, free)]
     assert (outputs[0] - outputs[1]).abs().max() > 1e-6
+
+
+@pytest.mark.parametrize("streams", [("geometric", "state"), ()])
+def test_recomputed_activations_give_the_same_gradients_to_the_bit(wiring, streams):
+    config = dataclasses.replace(SMALL, wiring=wiring)
+    maps, speed = inputs(config, 5)
+    gradients = []
+    for recomputes in (False, True):
+        network = build(config)
+        network.recomputes = recomputes
+        outputs, state = roll(network, maps, speed, streams=streams)
+        losses = [sum(o.offset.square().sum() + o.features[0].square().sum() for o in outputs)]
+        losses.append(sum(o.appearance.square().sum() for o in outputs))
+        weight = network.encoder.pyramid.first.weight
+        # Losses are compared by their gradients before all go back together.
+        apart = [torch.autograd.grad(loss, weight, retain_graph=True)[0] for loss in losses]
+        sum(losses).backward()
+        whole = [p.grad for p in network.parameters() if p.grad is not None]
+        gradients.append([*apart, *whole, *(o.offset.detach() for o in outputs), state.memory.detach()])
+    assert len(gradients[0]) == len(gradients[1]) > 20
+    assert all(torch.equal(kept, again) for kept, again in zip(*gradients, strict=True))

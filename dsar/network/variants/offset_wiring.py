@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from dsar.config import ModelConfig
 from dsar.network.encoder import WindowEncoder, WindowFeatures
-from dsar.network.layers import projection
+from dsar.network.layers import activate, projection
 from dsar.network.pyramid import Pyramid
 
 _OFFSET_CHANNEL_DIVISOR = 4
@@ -24,7 +24,7 @@ class PerFrameOffsetEncoder(WindowEncoder):
     def encode_frame(self, maps: Tensor, offsets: Tensor, static: Tensor) -> Sequence[Tensor]:
         """Return the frame's features."""
         inputs = torch.cat([maps, offsets], 1)
-        return self.pyramid.features(self.pyramid.first_convolution(inputs) + static)
+        return self.pyramid.features(activate(self.pyramid.first_convolution(inputs) + static))
 
 
 class LateOffsetEncoder(WindowEncoder):
@@ -40,13 +40,13 @@ class LateOffsetEncoder(WindowEncoder):
 
     def encode_frame(self, maps: Tensor, offsets: Tensor, static: Tensor) -> Sequence[Tensor]:
         """Return the frame's features."""
-        return self.pyramid.features(self.pyramid.first_convolution(maps) + static)
+        return self.pyramid.features(activate(self.pyramid.first_convolution(maps) + static))
 
     def assemble_window(self, precomputed: Sequence[Tensor], offsets: Tensor) -> WindowFeatures:
         """Return the frames' features, and those of the newest offsets."""
         pyramid = self.offset_pyramid
         if pyramid is None or self.widen is None:
             return WindowFeatures(tuple(precomputed))
-        thin = pyramid.features(pyramid.first_convolution(offsets) + pyramid.static_term(None))
+        thin = pyramid.features(activate(pyramid.first_convolution(offsets) + pyramid.static_term(None)))
         widened = (widen(x) for widen, x in zip(self.widen, thin, strict=True))
         return WindowFeatures(tuple(precomputed), tuple(widened))
