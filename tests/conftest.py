@@ -1,7 +1,11 @@
 """A tiny capture on disk, in the documented format: a speckled body that sways, seen by four cameras."""
 
+import fcntl
 import json
 import math
+import os
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -70,14 +74,34 @@ def speckled(body, motion):
         yield gaussians
 
 
+def made_once(tmp_path_factory, name: str, make: Callable[[Path], None]) -> Path:
+    """Return a folder that one of the processes that share the tests makes, and the others wait for."""
+    base = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        base = base.parent
+    folder = base / f"once-{name}"
+    with (base / f"once-{name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not folder.exists():
+            draft = base / f"once-{name}.draft"
+            shutil.rmtree(draft, ignore_errors=True)
+            draft.mkdir()
+            make(draft)
+            draft.rename(folder)
+    return folder
+
+
 @pytest.fixture(scope="session")
 def tiny_capture(tmp_path_factory) -> Path:
-    """Return the folder of the tiny capture."""
+    """Return the folder of the tiny capture, which nobody may write to."""
+    return made_once(tmp_path_factory, "tiny", write_tiny_capture)
+
+
+def write_tiny_capture(folder: Path) -> None:
     from dsar.body.files import load_body
     from dsar.data.motions.files import write_motion
     from dsar.raster import rasterize
 
-    folder = tmp_path_factory.mktemp("tiny")
     (folder / "motion").mkdir()
     body, rig = load_body(), cameras()
     sequences = {}
@@ -119,7 +143,6 @@ def tiny_capture(tmp_path_factory) -> Path:
         "one_to_many": [],
     }
     (folder / "capture.json").write_text(json.dumps(description))
-    return folder
 
 
 TINY = [
@@ -145,13 +168,18 @@ def train_arguments(capture: Path, out: Path, *more: str) -> list[str]:
 
 @pytest.fixture(scope="session")
 def trained(tiny_capture, tmp_path_factory) -> Path:
-    """Return the run folder of an avatar of the tiny capture, trained by one worker."""
+    """Return the run folder of an avatar of the tiny capture, trained by one worker.
+
+    Each process has a copy of its own, because commands leave figures and reports in it.
+    """
     from dsar.cli import main
 
-    out = tmp_path_factory.mktemp("runs") / "tiny"
-    figures = out.parent / "train.json"
-    main(train_arguments(tiny_capture, out, "--steps", "120", "--workers", "1", "--json", str(figures)))
-    return out
+    def train(folder: Path) -> None:
+        figures = ("--json", str(folder / "train.json"))
+        main(train_arguments(tiny_capture, folder / "tiny", "--steps", "120", "--workers", "1", *figures))
+
+    made = made_once(tmp_path_factory, "trained", train)
+    return shutil.copytree(made, tmp_path_factory.mktemp("runs"), dirs_exist_ok=True) / "tiny"
 
 
 @pytest.fixture(scope="session")

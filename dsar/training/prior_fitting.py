@@ -10,7 +10,6 @@ import dataclasses
 import logging
 from collections.abc import Mapping, Sequence
 
-import cma
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -114,6 +113,9 @@ class _Fit:
         """Search, and set the garment's constants, how it hangs, and how far it is trusted."""
         best = ClothConstants()
         if self.clips:
+            # Here, not above: it brings scipy.stats and matplotlib, a second of every process that trains.
+            import cma
+
             options = {"seed": seed + 1, "popsize": POPULATION, "verbose": -9}
             search = cma.CMAEvolutionStrategy(np.zeros(len(best.to_vector())), SPREAD, options)
             for _ in range(GENERATIONS):

@@ -21,7 +21,7 @@ from dsar.data.motions.files import write_motion
 from dsar.types import Motion
 from tests.conftest import train_arguments
 
-STEPS = ("--steps", "40", "--workers", "1")
+STEPS = ("--steps", "20", "--workers", "1")
 
 
 def native_part(tiny, folder, parts, fps=30.0, change=lambda image: image):
@@ -43,8 +43,13 @@ def native_part(tiny, folder, parts, fps=30.0, change=lambda image: image):
 
 
 def losses(capture, out, *more):
-    main(train_arguments(capture, out, *STEPS, *map(str, more)))
+    """Train; return the losses of every five updates, and leave no pictures."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("dsar.training.loop.REPORT_EVERY", 5)
+        patch.setattr("dsar.cli.train.write_previews", lambda folder, _: folder)
+        main(train_arguments(capture, out, *STEPS, *map(str, more)))
     lines = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines] == [5, 10, 15, 20]
     return np.array([line["loss"] for line in lines])
 
 
