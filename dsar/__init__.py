@@ -13,7 +13,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 _PUBLIC = {
     "open_capture": "dsar.data.captures.formats",
     "train": "dsar.training.loop",
-    "load": "dsar.training.checkpoint",
+    "load": "dsar.training.guard_limits",
     "roll_out": "dsar.avatar.rollout",
     "rasterize": "dsar.raster",
 }

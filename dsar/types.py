@@ -227,6 +227,29 @@ class DeepSamples:
 
 
 @dataclass(frozen=True)
+class GuardedFrame:
+    """What guards found in one frame, and what they did about it."""
+
+    exceeded: Mapping[str, float]
+    """By a guard's name (`dsar.avatar.guards.Guard`) how many times training's largest there was; infinite
+    where there was no number, and for a cut, which has no measure."""
+    held: float = 0.0
+    """Share of the offsets that is held from the frame before, in [0, 1): while it is above 0, what is shown
+    is not what the network says."""
+
+    def merged(self, other: "GuardedFrame") -> "GuardedFrame":
+        """Return the worse of two frames, for a time between them."""
+        names = self.exceeded.keys() | other.exceeded.keys()
+        worst = {name: max(self.exceeded.get(name, 0.0), other.exceeded.get(name, 0.0)) for name in names}
+        return GuardedFrame(dict(sorted(worst.items())), max(self.held, other.held))
+
+    def describe(self) -> str:
+        """Return it as one word for each guard, for the headers of files: `size=2.31 held=0.83`."""
+        words = [f"{name}={value:.3g}" for name, value in self.exceeded.items()]
+        return " ".join([*words, *([f"held={self.held:.3g}"] if self.held else [])])
+
+
+@dataclass(frozen=True)
 class Picture:
     """One camera's image of one frame, with all that a file of it says."""
 
@@ -246,6 +269,8 @@ class Picture:
     """When the shutter opens and closes, in frames from the frame's own time."""
     fps: float = 24.0
     """Frames per second of the frame numbers."""
+    guarded: GuardedFrame | None = None
+    """What guards found in the frame, if anything."""
     provenance: Mapping[str, str] = field(default_factory=dict)
     """Where the image comes from; written into every file."""
 
@@ -285,6 +310,8 @@ class GaussianSequence:
     """Where the frames come from: checkpoint hash, motion, version. Written into every file."""
     binding: Binding | None = field(default=None, repr=False)
     """The body that carries the Gaussians, if there is one."""
+    guarded: Mapping[int, GuardedFrame] = field(default_factory=dict, repr=False)
+    """By frame number what guards found; filled as the frames of a pass are produced, and no others."""
 
     def __len__(self) -> int:
         """Return the number of frames."""

@@ -13,6 +13,7 @@ from dsar.avatar.control_grid import ControlGrid
 from dsar.avatar.driving import DrivingSignal
 from dsar.avatar.fused_posing import pose_fused
 from dsar.avatar.garment_chart import fit_garment_chart, texels_beneath
+from dsar.avatar.guard_limits import GuardLimits
 from dsar.avatar.guards import LIMITS, Guard
 from dsar.avatar.input_maps import InputMaps, make_input_maps
 from dsar.avatar.input_statistics import InputStatistics
@@ -90,6 +91,8 @@ class Avatar(nn.Module):
         self.principal_poses = PrincipalPoses(model.pose_components, len(self.control.cells), LIMITS.pose)
         self.template = GaussianParameters(atlas.positions, atlas.tangents, atlas.hidden, model.sh_degree)
         self.network = build_network(model, self.control.occupied)
+        self.guard_limits: GuardLimits | None = None
+        """Where guards of rollouts act; None: rollouts show what the network says, whatever it is."""
 
     @classmethod
     def from_capture(cls, capture: Capture, body: Body, atlas: AtlasConfig, model: ModelConfig) -> "Avatar":
@@ -156,8 +159,8 @@ class Avatar(nn.Module):
         """Return a driving signal with what the motion prior makes of it now, if there is one."""
         if self.prior is None:
             return signal
-        cloth = self.prior.simulate(self.body, signal.steady, signal.fps)
-        return dataclasses.replace(signal, cloth=cloth)
+        shots = [self.prior.simulate(self.body, signal.steady[shot], signal.fps) for shot in signal.shots]
+        return dataclasses.replace(signal, cloth=torch.cat(shots))
 
     @torch.no_grad()
     def place_prior(self) -> None:

@@ -5,8 +5,12 @@ it, newest first, and then running means of these transforms, relative to the pe
 time constant: where inertia would have left the cloth. A *driving signal* holds the motion window of every
 frame.
 
-Where a body jumps (a cut, a glitch of the capture), its past jumps with it: nothing on earth moves so fast,
-and cloth that were told of it would fly apart.
+Where a body jumps (a teleport, a glitch of the capture), its past jumps with it: nothing on earth moves so
+fast, and cloth that were told of it would fly apart. The pose goes on, so that the cloth does, too.
+
+Where the pose itself is cut, no past belongs to the new one: a limb carried there would sweep through the
+cloth within a frame. The signal begins anew, as if the body had always stood so; a cut is where two shots
+were joined, and each shot looks as it would alone.
 """
 
 import logging
@@ -24,6 +28,8 @@ from dsar.geometry.rotations import heading_matrix
 from dsar.types import Body, Motion
 
 LOGGER = logging.getLogger(__name__)
+_BODY_JOINTS = 22
+"""Pelvis, legs, spine, head and arms; the face and the fingers come after them."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +50,14 @@ class DrivingSignal:
     """The transforms without what jumps have done to the body's place on the ground and its heading."""
     cloth: Float[Tensor, "f g 6"] | None = None
     """Where the avatar's motion prior has its garments, if it has one (see `dsar.avatar.motion_prior`)."""
+    cuts: tuple[int, ...] = ()
+    """Frames that begin another shot: nothing before them is known there."""
+
+    @property
+    def shots(self) -> list[slice]:
+        """The frames between cuts."""
+        ends = [*self.cuts, len(self)]
+        return [slice(first, end) for first, end in zip([0, *self.cuts], ends, strict=True)]
 
     def __len__(self) -> int:
         """Return the number of frames."""
@@ -60,7 +74,19 @@ class DrivingSignal:
         """
         rotations, translations = motion.rotations.to(body.joints), motion.translations.to(body.joints)
         transforms = forward_kinematics(body, rotations, translations)
-        signal = cls.of_transforms(transforms, body.joints[0], motion.fps, time_constants, motion.name)
+        cuts = find_cuts(transforms, body.joints, motion.fps)
+        ends = [*cuts, len(transforms)]
+        shots = [
+            cls.of_transforms(transforms[first:end], body.joints[0], motion.fps, time_constants, motion.name)
+            for first, end in zip([0, *cuts], ends, strict=True)
+        ]
+        signal = shots[0] if not cuts else cls._join(shots, cuts)
+        if cuts:
+            LOGGER.warning(
+                "Motion %s: the pose is cut at frame %d of %d (%.2f s)%s; the clothes begin anew there",
+                *(motion.name, cuts[0], len(motion), cuts[0] / motion.fps),
+                f" and at {len(cuts) - 1} more" if len(cuts) > 1 else "",
+            )
         for frame in signal.jumps:
             LOGGER.warning(
                 "Motion %s: the body jumps at frame %d of %d (%.2f s); its clothes go with it",
@@ -99,6 +125,20 @@ class DrivingSignal:
         windows = jumped[:, None, None] @ _windows(steady, pelvis, fps, time_constants)
         return cls(name, fps, transforms, windows, tuple(jumps), steady)
 
+    @classmethod
+    def _join(cls, shots: Sequence["DrivingSignal"], cuts: Sequence[int]) -> "DrivingSignal":
+        """Return the signal of shots that begin at frame 0 and at cuts."""
+        starts = zip([0, *cuts], shots, strict=True)
+        return cls(
+            name=shots[0].name,
+            fps=shots[0].fps,
+            transforms=torch.cat([shot.transforms for shot in shots]),
+            windows=torch.cat([shot.windows for shot in shots]),
+            jumps=tuple(start + jump for start, shot in starts for jump in shot.jumps),
+            steady=torch.cat([shot.steady for shot in shots]),
+            cuts=tuple(cuts),
+        )
+
     def cloth_at(self, frames: Sequence[int]) -> Float[Tensor, "b g 6"] | None:
         """Return the motion prior in some frames."""
         if self.cloth is None:
@@ -117,6 +157,20 @@ def find_jumps(transforms: Float[Tensor, "f j 4 4"], pelvis: Float[Tensor, "3"],
     cosines = (change.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
     turned = cosines < math.cos(min(LIMITS.jump_angular_speed / fps, math.pi))
     return [int(frame) + 1 for frame in (far | turned).nonzero()]
+
+
+def find_cuts(transforms: Float[Tensor, "f j 4 4"], joints: Float[Tensor, "j 3"], fps: float) -> list[int]:
+    """Return the frames whose pose cannot have come from the frame before.
+
+    Args:
+        transforms: T_world_rest by frame and joint.
+        joints: Their positions at rest, metres.
+        fps: Frames per second.
+    """
+    relative = transforms[:, :1].inverse() @ transforms[:, :_BODY_JOINTS]
+    places = (relative[..., :3, :3] @ joints[:_BODY_JOINTS, :, None]).squeeze(-1) + relative[..., :3, 3]
+    speeds = places.diff(dim=0).norm(dim=-1).mean(-1) * fps
+    return [int(frame) + 1 for frame in (speeds > LIMITS.cut_speed).nonzero()]
 
 
 def _windows(

@@ -21,6 +21,9 @@ class Limits:
     """Speed of the pelvis, m/s, above which a frame is a discontinuity: a cut or a teleport."""
     jump_angular_speed: float = 20 * math.pi
     """Angular speed of the pelvis, rad/s, above which it is one, too: no skater turns ten times a second."""
+    cut_speed: float = 6.0
+    """Mean speed of the body's joints as the pelvis sees them, m/s, above which a frame begins another shot:
+    a sprinter's is below 4, for only the feet are fast."""
     speed: float = 0.4
     """Metres per 1/30 s (12 m/s) at which velocities of control points are cut for the network."""
     lag: float = 1.0
@@ -42,6 +45,8 @@ class Guard(StrEnum):
 
     JUMP = "jump"
     """The body is where it cannot have come from the frame before: its past goes with it."""
+    CUT = "cut"
+    """The pose cannot have come from the frame before: the clothes begin anew, as in a first frame."""
     SPEED = "speed"
     """A control point's velocity was cut."""
     LAG = "lag"
@@ -50,6 +55,14 @@ class Guard(StrEnum):
     """A principal component of the pose was moved into the range of training."""
     OFFSET = "offset"
     """An offset of the network came near its limit."""
+    FAR = "far"
+    """The input maps are far from training's: nothing is changed, the user is warned."""
+    FINITE = "finite"
+    """The network's output has values that are not finite: the frame is replaced (see `watchdog`)."""
+    SIZE = "size"
+    """An offset or a residual is far beyond training's largest: the frame is replaced."""
+    JITTER = "jitter"
+    """The offsets tremble beyond what training shows: the frame is replaced."""
 
 
 GuardCounts = Mapping[Guard, Int[Tensor, " b"]]

@@ -4,19 +4,21 @@ Rendering, exports and viewers all play avatars by it. A frame follows from all 
 does not begin anew, the player keeps snapshots of the network's memory on its way.
 """
 
-from collections.abc import Collection
+import math
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from dsar.avatar.avatar import Avatar
 from dsar.avatar.driving import DrivingSignal
 from dsar.avatar.guards import LIMITS, Guard, GuardCounts, fired
+from dsar.avatar.watchdog import Watchdog, WatchdogState
 from dsar.network import STREAMS, NetworkOutput, Stream
 from dsar.network.session import InferenceSession, SessionSnapshot
-from dsar.types import Gaussians
+from dsar.types import Gaussians, GuardedFrame
 
 SNAPSHOT_FRAMES = 30
 """Frames between snapshots of a short motion."""
@@ -36,6 +38,8 @@ class NetworkFrame:
     """What the network made of it; on a GPU it lasts until the next frame."""
     guard_counts: GuardCounts
     """What each guard limited."""
+    guarded: GuardedFrame | None = None
+    """What guards found amiss, and did; None where nothing was."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +52,8 @@ class PlayedFrame:
     """Posed."""
     guard_counts: GuardCounts
     """What each guard limited."""
+    guarded: GuardedFrame | None = None
+    """What guards found amiss, and did; None where nothing was."""
 
     @property
     def fired(self) -> frozenset[Guard]:
@@ -62,18 +68,28 @@ class Player:
     """
 
     def __init__(
-        self, avatar: Avatar, signal: DrivingSignal, *, streams: Collection[Stream] = STREAMS
+        self,
+        avatar: Avatar,
+        signal: DrivingSignal,
+        *,
+        streams: Collection[Stream] = STREAMS,
+        guarded: bool = True,
     ) -> None:
         """Begin before the first frame of a signal at the avatar's rate.
 
-        Without one of the `streams` the network runs as if it had none of its memory.
+        Without one of the `streams` the network runs as if it had none of its memory. Where the avatar has
+        limits for it (`Avatar.guard_limits`) and the player is guarded, a watchdog replaces frames that would
+        break.
         """
         self.avatar, self.signal = avatar, signal
         self._session = InferenceSession(avatar.network, streams)
-        jumped = signal.windows.new_zeros(len(signal), dtype=torch.int64)
-        jumped[list(signal.jumps)] = 1
-        self._jumped, self._next, self._distance = jumped, 0, SNAPSHOT_FRAMES
-        self._snapshots: dict[int, SessionSnapshot] = {0: self._session.snapshot()}
+        self._breaks = {Guard.JUMP: frozenset(signal.jumps), Guard.CUT: frozenset(signal.cuts)}
+        self._jumped, self._cut = (_marks(signal, frames) for frames in (signal.jumps, signal.cuts))
+        self._next, self._distance = 0, SNAPSHOT_FRAMES
+        self._fresh = self._session.snapshot()
+        limits = avatar.guard_limits if guarded else None
+        self._watchdog = None if limits is None else Watchdog(limits, avatar.fps, signal.windows.device)
+        self._snapshots: dict[int, _Snapshot] = {0: self._snapshot()}
 
     @property
     def next_frame(self) -> int:
@@ -92,7 +108,10 @@ class Player:
             raise IndexError(f"frame {frame} of {self.signal.name}, which has {len(self.signal)}")
         known = max(number for number in self._snapshots if number <= frame)
         if not known <= self._next <= frame:
-            self._session.restore(self._snapshots[known])
+            session, watchdog = self._snapshots[known]
+            self._session.restore(session)
+            if self._watchdog is not None and watchdog is not None:
+                self._watchdog.state = watchdog
             self._next = known
         while self._next < frame:
             self.forward_frame()
@@ -102,7 +121,7 @@ class Player:
         frame = self.forward_frame()
         with torch.no_grad():
             gaussians = self.avatar.gaussians(frame.motion_window, frame.output)[0]
-        return PlayedFrame(frame.number, gaussians, frame.guard_counts)
+        return PlayedFrame(frame.number, gaussians, frame.guard_counts, frame.guarded)
 
     @torch.no_grad()
     def forward_frame(self) -> NetworkFrame:
@@ -116,21 +135,80 @@ class Player:
             raise IndexError(f"{self.signal.name} ends after {number} frames")
         if number % self._distance == 0 and number not in self._snapshots:
             self._keep_snapshot(number)
-        motion_window = self.signal.windows[number : number + 1]
+        cut = number in self._breaks[Guard.CUT]
+        if cut:
+            self._session.restore(self._fresh)
+        window = self.signal.windows[number : number + 1]
         cloth = self.signal.cloth_at(range(number, number + 1))
-        inputs = avatar.input_maps(motion_window, avatar.fps, cloth)
-        output = avatar.add_prior(self._session.step(*avatar.standardize(inputs)), cloth)
+        inputs = avatar.input_maps(window, avatar.fps, cloth)
+        maps, magnitude = avatar.standardize(inputs)
+        output = avatar.add_prior(self._session.step(maps, magnitude), cloth)
         near = LIMITS.offset * avatar.model.offset_limit
         counts = {
             **inputs.guard_counts,
             Guard.OFFSET: (output.offset.abs() > near).sum((1, 2, 3)),
             Guard.JUMP: self._jumped[number : number + 1],
+            Guard.CUT: self._cut[number : number + 1],
         }
+        guarded = None
+        if self._watchdog is not None:
+            if cut:
+                self._watchdog.forget()
+            pose_only = _PoseOnly(avatar, self._session, self._fresh, maps, magnitude, cloth)
+            output, guarded = self._watchdog.watch(maps, output, pose_only)
+            passed = [guard for guard, where in self._breaks.items() if number in where]
+            guarded = _with_breaks(guarded, passed)
         self._next += 1
-        return NetworkFrame(number, motion_window, output, counts)
+        return NetworkFrame(number, window, output, counts, guarded)
+
+    def _snapshot(self) -> "_Snapshot":
+        return self._session.snapshot(), None if self._watchdog is None else self._watchdog.state
 
     def _keep_snapshot(self, number: int) -> None:
-        self._snapshots[number] = self._session.snapshot()
+        self._snapshots[number] = self._snapshot()
         if len(self._snapshots) > MAX_SNAPSHOTS:
             self._distance *= 2
             self._snapshots = {n: s for n, s in self._snapshots.items() if n % self._distance == 0}
+
+
+_Snapshot = tuple[SessionSnapshot, WatchdogState | None]
+
+
+@dataclass(frozen=True)
+class _PoseOnly:
+    """Makes one frame of its pose alone, whatever the session remembers (`watchdog.PoseOnly`)."""
+
+    avatar: Avatar
+    session: InferenceSession
+    fresh: SessionSnapshot
+    maps: Float[Tensor, "1 c h w"]
+    magnitude: Float[Tensor, "1 1 h w"]
+    cloth: Float[Tensor, "1 g 6"] | None
+
+    def restart(self) -> NetworkOutput:
+        """Drop the session's memory and return what the network makes of this frame as a first one."""
+        self.session.restore(self.fresh)
+        return self.avatar.add_prior(self.session.step(self.maps, self.magnitude), self.cloth)
+
+    def template(self) -> NetworkOutput:
+        """Drop the session's memory and return the output of a network that says nothing."""
+        self.session.restore(self.fresh)
+        points = self.maps.new_zeros(1, len(self.avatar.garment_control_points()), 3)
+        return self.avatar.offset_garment(points)
+
+
+def _marks(signal: DrivingSignal, frames: Sequence[int]) -> Int64[Tensor, " f"]:
+    """Return 1 in some frames of a signal, 0 in the others."""
+    marks = signal.windows.new_zeros(len(signal), dtype=torch.int64)
+    marks[list(frames)] = 1
+    return marks
+
+
+def _with_breaks(found: GuardedFrame | None, breaks: Collection[Guard]) -> GuardedFrame | None:
+    """Return what was found in a frame, and the breaks in its motion."""
+    if not breaks:
+        return found
+    exceeded = {str(guard): math.inf for guard in breaks}
+    return GuardedFrame(
+        {**exceeded, **({} if found is None else found.exceeded)}, 0.0 if found is None else found.held
+    )

@@ -46,7 +46,7 @@ def locate_frames(signal: DrivingSignal, delivered: Motion) -> list[RolloutTime]
             f"motion {signal.name}: expected a delivery of its {len(signal) / signal.fps:g} s, found "
             f"{len(delivered)} frames at {delivered.fps:g} a second: resample the same motion for both"
         )
-    return [_locate(frame * ratio, signal.jumps) for frame in range(len(delivered))]
+    return [_locate(frame * ratio, (*signal.jumps, *signal.cuts)) for frame in range(len(delivered))]
 
 
 def delivery_transforms(

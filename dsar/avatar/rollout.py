@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from dsar.avatar.avatar import Avatar
+from dsar.avatar.guard_report import log_guarded
 from dsar.avatar.player import Player
 from dsar.avatar.resampling import (
     RolloutTime,
@@ -21,7 +22,7 @@ from dsar.errors import MotionError
 from dsar.geometry.camera_paths import START_FRAME
 from dsar.geometry.frame_rates import same_rate
 from dsar.network import STREAMS, NetworkOutput, Stream
-from dsar.types import Binding, Gaussians, GaussianSequence, Motion
+from dsar.types import Binding, Gaussians, GaussianSequence, GuardedFrame, Motion
 
 
 def roll_out(
@@ -72,13 +73,25 @@ def roll_out(
     times = locate_frames(signal, delivered)
     poses = delivery_transforms(avatar.body, signal, delivered, times)[wanted]
     times = [times[frame] for frame in wanted]
+    guarded: dict[int, GuardedFrame] = {}
+
+    def produce() -> Iterator[Gaussians]:
+        guarded.clear()
+        player = Player(avatar, signal, streams=streams)
+        for number, (gaussians, found) in zip(numbers, _deliver(player, times, poses), strict=True):
+            if found is not None:
+                guarded[number] = found
+            yield gaussians
+        log_guarded(motion.name, guarded, len(numbers))
+
     return GaussianSequence(
         frame_numbers=numbers,
         fps=avatar.fps if same_rate(delivered.fps, avatar.fps) else delivered.fps,
         num_gaussians=avatar.num_gaussians,
-        produce=lambda: _deliver(Player(avatar, signal, streams=streams), times, poses),
+        produce=produce,
         provenance={"motion": motion.name, **(provenance or {})},
         binding=_bind(avatar, poses),
+        guarded=guarded,
     )
 
 
@@ -109,7 +122,7 @@ def template_sequence(sequence: GaussianSequence, avatar: Avatar, motion: Motion
             frame = number - START_FRAME
             yield avatar.gaussians(signal.windows[frame : frame + 1], None)[0]
 
-    return dataclasses.replace(sequence, produce=produce)
+    return dataclasses.replace(sequence, produce=produce, guarded={})
 
 
 def network_outputs(
@@ -127,14 +140,18 @@ def network_outputs(
 
 def _deliver(
     player: Player, times: Sequence[RolloutTime], transforms: Float[Tensor, "f j 4 4"]
-) -> Iterator[Gaussians]:
-    """Yield the Gaussians at ascending times of a rollout; `transforms` are the body's, time by time."""
+) -> Iterator[tuple[Gaussians, GuardedFrame | None]]:
+    """Yield the Gaussians at ascending times of a rollout, and what guards found there.
+
+    `transforms` are the body's, time by time.
+    """
     avatar, last = player.avatar, len(player.signal) - 1
-    newest, before = player.forward_frame(), None
+    newest, before, found_before = player.forward_frame(), None, None
     for time, pose in zip(times, transforms, strict=True):
         while newest.number < min(time.step + (time.fraction > 0), last):
-            before = copy_residuals(newest.output)
+            before, found_before = copy_residuals(newest.output), newest.guarded
             newest = player.forward_frame()
+        found = newest.guarded
         with torch.no_grad():
             if time.fraction == 0:
                 gaussians = avatar.gaussians(newest.motion_window, newest.output)[0]
@@ -143,5 +160,11 @@ def _deliver(
                 residuals = newest.output
                 if before is not None and time.step < newest.number:
                     residuals = interpolate_residuals(before, residuals, time.fraction)
+                    found = _worse(found_before, found)
                 gaussians = avatar.gaussians(pose[None, None], residuals)[0]
-        yield gaussians
+        yield gaussians, found
+
+
+def _worse(one: GuardedFrame | None, other: GuardedFrame | None) -> GuardedFrame | None:
+    """Return what was found in either of two frames."""
+    return one.merged(other) if one is not None and other is not None else one or other

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import re
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -17,7 +18,9 @@ from dsar.types import GaussianSequence
 if TYPE_CHECKING:
     import torch
 
+    from dsar.avatar.avatar import Avatar
     from dsar.data.captures.multiview import MultiViewCapture
+    from dsar.training.checkpoint import Run
     from dsar.training.scene import Scene
 
 
@@ -87,6 +90,22 @@ class RunCommand(Common):
         from dsar.training.checkpoint import newest_run
 
         return self.run_folder or newest_run().folder
+
+
+@dataclass(frozen=True)
+class GuardedCommand(RunCommand):
+    """Flags of commands that roll a trained avatar out."""
+
+    no_guards: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Show what the network says, whatever it is; otherwise frames that would break are replaced, and a
+    motion far from training is warned of."""
+
+    def guard(self, run: "Run", avatar: "Avatar", scene: "Callable[[], Scene]") -> None:
+        """Give an avatar that was loaded from a run its guards, if they are wanted."""
+        from dsar.training.guard_limits import attach_guards
+
+        if not self.no_guards:
+            attach_guards(run, avatar, scene)
 
 
 def file_stem(label: str) -> str:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dsar.cli.command import RunCommand, file_stem, resolve_sequence
+from dsar.cli.command import GuardedCommand, file_stem, resolve_sequence
 from dsar.console import ProgressBar
 from dsar.errors import ConfigError
 
@@ -23,7 +23,7 @@ _PAGES = Path("runs/check")
 
 
 @dataclass(frozen=True)
-class Crosscheck(RunCommand):
+class Crosscheck(GuardedCommand):
     """Prove cameras, files and images of a run, or of a capture, by another renderer: Mitsuba."""
 
     capture: str | None = None
@@ -105,6 +105,7 @@ class Crosscheck(RunCommand):
         run = Run(self.chosen_run())
         avatar, config, _ = load_checkpoint(run, device)
         scene = open_scene(run, config)
+        self.guard(run, avatar, lambda: scene)
         motion = scene.motions[self.sequence(scene)]
 
         def drive() -> "Gaussians":

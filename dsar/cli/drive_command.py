@@ -8,7 +8,7 @@ from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from dsar.cli.command import RunCommand, resolve_sequence
+from dsar.cli.command import GuardedCommand, resolve_sequence
 from dsar.errors import ConfigError, DsarError
 from dsar.geometry.camera_paths import START_FRAME
 from dsar.geometry.frame_numbers import parse_frames
@@ -55,7 +55,7 @@ class DrivenAvatar:
 
 
 @dataclass(frozen=True)
-class DriveCommand(RunCommand):
+class DriveCommand(GuardedCommand):
     """Flags of commands that drive a trained avatar."""
 
     motion: str = "test"
@@ -103,8 +103,9 @@ class DriveCommand(RunCommand):
         run, file = Run(self.chosen_run()), self.motion_file()
         avatar, config, provenance = load_checkpoint(run, device)
         body = avatar.body.to(device="cpu")
-        body = avatar.body.to(device="cpu")
         scene, training = cache(partial(open_scene, run, config)), None
+        self.guard(run, avatar, scene)
+        provenance["guards"] = "off" if avatar.guard_limits is None else "on"
         if file is None:
             self._refuse_file_flags(self.motion)
             motion = _sequence(scene(), self.motion)

@@ -5,12 +5,12 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from dsar.cli.command import RunCommand, resolve_sequence
+from dsar.cli.command import GuardedCommand, resolve_sequence
 from dsar.console import track_progress
 
 
 @dataclass(frozen=True)
-class Stress(RunCommand):
+class Stress(GuardedCommand):
     """Drive an avatar where rollouts fail."""
 
     def output_folders(self) -> list[Path]:
@@ -29,6 +29,7 @@ class Stress(RunCommand):
         run = Run(self.chosen_run())
         avatar, config, _ = load_checkpoint(run, device)
         scene = open_scene(run, config)
+        self.guard(run, avatar, lambda: scene)
         verdicts = stress(avatar, scene.motions[resolve_sequence(scene, "test") or ""], CASES)
         cases = {}
         for name, verdict in track_progress(verdicts, len(CASES), self.progress, "stress"):

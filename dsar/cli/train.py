@@ -157,9 +157,13 @@ class Train(Common):
         return last
 
     def _show_results(self, last: "list[Report]", device: "torch.device") -> None:
-        from dsar.training.checkpoint import Run, read_progress
+        from dsar.training.checkpoint import Run, load_checkpoint, read_progress
+        from dsar.training.guard_limits import attach_guards
+        from dsar.training.scene import open_scene
 
         run = Run(self.folder)
+        avatar, config, _ = load_checkpoint(run, device)
+        attach_guards(run, avatar, lambda: open_scene(run, config))
         sheet = write_previews(run.folder, device)
         reached = dataclasses.asdict(last[-1] if last else read_progress(run))
         self.write_json({"run": str(run.folder), "sheet": str(sheet), **reached})

@@ -7,6 +7,7 @@ checkpoint/              replaced as a whole, never half written
     adam.safetensors, muon.safetensors   moments of the optimisers
     rollouts-<rank>.safetensors   where each worker's rollouts stand, and what they remember
     registration-<rank>.safetensors   offsets of the still and the registered frames
+    guards.safetensors       where guards act, once they were measured (`dsar.training.guard_limits`)
     progress.json            step, progress, format version, the run's folder at that time
 metrics.jsonl            one line per report
 figures.json, stress.json   what `dsar eval` and `dsar stress` found
@@ -98,6 +99,11 @@ class Run:
     def checkpoint(self) -> Path:
         """The newest complete checkpoint."""
         return self.folder / "checkpoint"
+
+    @property
+    def guards(self) -> Path:
+        """Where the guards of the checkpoint's rollouts act (`dsar.training.guard_limits`)."""
+        return self.checkpoint / "guards.safetensors"
 
     @property
     def exists(self) -> bool:
@@ -338,8 +344,3 @@ def replace_folder(new: Path, final: Path) -> None:
         os.replace(final, old)
     os.replace(new, final)
     shutil.rmtree(old, ignore_errors=True)
-
-
-def load(folder: str | Path, device: torch.device | str = "cpu") -> Avatar:
-    """Return the trained avatar of a run folder, on a device."""
-    return load_checkpoint(Run(Path(folder)), device)[0]

@@ -3,6 +3,7 @@
 import dataclasses
 import importlib.metadata
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any
 from fileseq.frameset import FrameSet
 
 from dsar.atomic_files import atomic_write
-from dsar.types import GaussianSequence
+from dsar.types import GaussianSequence, GuardedFrame
 
 _PACKAGES = ("dsar-avatar", "torch", "usd-core", "plyfile", "gsply", "fourdgs")
 _IDS = "index 0 to gaussians - 1: the same Gaussian in every frame and every format that keeps order"
@@ -53,6 +54,9 @@ class Manifest:
     provenance: Mapping[str, str]
     versions: Mapping[str, str]
     """Of the packages that had a hand in it."""
+    guarded: Mapping[int, Mapping[str, Any]]
+    """By frame number what guards found there and did: by their names how many times training's largest there
+    was (null: no number), and the share of the offsets that is `held` from the frame before."""
     files: Sequence[str]
     """As seen from the manifest's own folder."""
 
@@ -89,12 +93,19 @@ def write_manifest(
         half=half,
         provenance=dict(sequence.provenance),
         versions=_versions(),
+        guarded={number: _describe_guarded(frame) for number, frame in sorted(sequence.guarded.items())},
         files=[file.absolute().relative_to(folder).as_posix() for file in files],
     )
     target = manifest_path(path)
     with atomic_write(target) as draft:
         draft.write_text(json.dumps(manifest.to_json(), indent=2) + "\n")
     return target
+
+
+def _describe_guarded(frame: GuardedFrame) -> dict[str, Any]:
+    """Return what guards found in a frame, in numbers that JSON has."""
+    exceeded = {name: value if math.isfinite(value) else None for name, value in frame.exceeded.items()}
+    return {"exceeded": exceeded, "held": frame.held}
 
 
 def _versions() -> dict[str, str]:

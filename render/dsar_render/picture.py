@@ -70,6 +70,7 @@ def render_picture(
         overscan=settings.overscan,
         shutter=settings.shutter,
         fps=fps,
+        guarded=triplet.guarded,
         provenance=provenance or {},
     )
 

@@ -1,11 +1,11 @@
 """Frames of a rollout with those beside them: what motion vectors and open shutters need."""
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
 
-from dsar.types import Gaussians, GaussianSequence
+from dsar.types import Gaussians, GaussianSequence, GuardedFrame
 
 
 @dataclass(frozen=True)
@@ -17,6 +17,8 @@ class FrameTriplet:
     current: Gaussians
     previous: Gaussians | None = None
     following: Gaussians | None = None
+    guarded: GuardedFrame | None = None
+    """What guards found in the frame."""
 
     def interpolate(self, offset: float) -> Gaussians:
         """Return the Gaussians `offset` frames (-1 to 1) from the frame.
@@ -45,22 +47,27 @@ def iterate_triplets(
     """
     if not neighbours:
         yield from (
-            FrameTriplet(number, gaussians.detach()) for number, gaussians in sequence if number in frames
+            FrameTriplet(number, gaussians.detach(), guarded=sequence.guarded.get(number))
+            for number, gaussians in sequence
+            if number in frames
         )
         return
     recent: list[tuple[int, Gaussians]] = []
     for number, gaussians in sequence:
         recent = [*recent[-2:], (number, gaussians.detach())]
         if len(recent) > 1 and recent[-2][0] in frames:
-            yield _join(recent, recent[-2][0])
+            yield _join(recent, recent[-2][0], sequence.guarded)
     if recent and recent[-1][0] in frames:
-        yield _join(recent, recent[-1][0])
+        yield _join(recent, recent[-1][0], sequence.guarded)
 
 
-def _join(recent: Sequence[tuple[int, Gaussians]], frame: int) -> FrameTriplet:
+def _join(
+    recent: Sequence[tuple[int, Gaussians]], frame: int, guarded: Mapping[int, GuardedFrame]
+) -> FrameTriplet:
     """Return the triplet of a frame among the most recent ones."""
     gaussians = dict(recent)
-    return FrameTriplet(frame, gaussians[frame], gaussians.get(frame - 1), gaussians.get(frame + 1))
+    beside = gaussians.get(frame - 1), gaussians.get(frame + 1)
+    return FrameTriplet(frame, gaussians[frame], *beside, guarded.get(frame))
 
 
 def _lerp(first: Gaussians, second: Gaussians, fraction: float) -> Gaussians:

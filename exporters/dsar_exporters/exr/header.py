@@ -39,6 +39,7 @@ def make_header(picture: Picture, interop_id: str, window: Window, job_hash: str
         **({"chromaticities": chromaticities} if chromaticities else {}),
         "software": f"dsar {picture.provenance.get('dsar', '')}".strip(),
         **{f"dsar/{key}": value for key, value in picture.provenance.items()},
+        **({"dsar/guarded": picture.guarded.describe()} if picture.guarded else {}),
         "dsar/frame": str(picture.frame),
         "dsar/job": job_hash,
     }

@@ -54,7 +54,12 @@ class GltfSnapshot:
             yield write
             draft.with_name("draft.glb").replace(draft)
         first = GaussianSequence(
-            frames, sequence.fps, sequence.num_gaussians, sequence.produce, sequence.provenance
+            frames,
+            sequence.fps,
+            sequence.num_gaussians,
+            sequence.produce,
+            sequence.provenance,
+            guarded={frame: found for frame, found in sequence.guarded.items() if frame == frames[0]},
         )
         write_manifest(self.path, first, [self.path])
 

@@ -107,6 +107,7 @@ class AssetWriter:
         if self._clips is not None:
             self._clips.bind(layers[0], [f"/{level.name}" for level in self._levels])
         for layer in layers:
+            _describe_guarded(layer, self._sequence)
             layer.Save()
 
     def _write_earlier(self, velocities: torch.Tensor) -> None:
@@ -256,3 +257,12 @@ def _describe(stage: Usd.Stage, sequence: GaussianSequence, name: str | None) ->
     model.SetAssetIdentifier(Sdf.AssetPath(f"./{Path(stage.GetRootLayer().realPath).name}"))
     if version := sequence.provenance.get("checkpoint"):
         model.SetAssetVersion(version)
+
+
+def _describe_guarded(layer: Sdf.Layer, sequence: GaussianSequence) -> None:
+    """Author what guards found, by frame number, beside the provenance; nothing where they found nothing."""
+    if not sequence.guarded:
+        return
+    found = {str(number): frame.describe() for number, frame in sorted(sequence.guarded.items())}
+    data = layer.customLayerData
+    layer.customLayerData = {**data, "dsar": {**data["dsar"], "guarded": found}}
