@@ -36,6 +36,8 @@ class NetworkFrame:
     """What drives the frame."""
     output: NetworkOutput
     """What the network made of it; on a GPU it lasts until the next frame."""
+    own: NetworkOutput
+    """The same without the motion prior, if the avatar has one."""
     guard_counts: GuardCounts
     """What each guard limited."""
     guarded: GuardedFrame | None = None
@@ -142,7 +144,17 @@ class Player:
         cloth = self.signal.cloth_at(range(number, number + 1))
         inputs = avatar.input_maps(window, avatar.fps, cloth)
         maps, magnitude = avatar.standardize(inputs)
-        output = avatar.add_prior(self._session.step(maps, magnitude), cloth)
+        own = self._session.step(maps, magnitude)
+        guarded = None
+        if self._watchdog is not None:
+            if cut:
+                self._watchdog.forget()
+            pose_only = _PoseOnly(avatar, self._session, self._fresh, maps, magnitude)
+            own, guarded = self._watchdog.watch(maps, own, pose_only)
+            guarded = _with_breaks(
+                guarded, [guard for guard, where in self._breaks.items() if number in where]
+            )
+        output = avatar.add_prior(own, cloth)
         near = LIMITS.offset * avatar.model.offset_limit
         counts = {
             **inputs.guard_counts,
@@ -150,16 +162,8 @@ class Player:
             Guard.JUMP: self._jumped[number : number + 1],
             Guard.CUT: self._cut[number : number + 1],
         }
-        guarded = None
-        if self._watchdog is not None:
-            if cut:
-                self._watchdog.forget()
-            pose_only = _PoseOnly(avatar, self._session, self._fresh, maps, magnitude, cloth)
-            output, guarded = self._watchdog.watch(maps, output, pose_only)
-            passed = [guard for guard, where in self._breaks.items() if number in where]
-            guarded = _with_breaks(guarded, passed)
         self._next += 1
-        return NetworkFrame(number, window, output, counts, guarded)
+        return NetworkFrame(number, window, output, own, counts, guarded)
 
     def _snapshot(self) -> "_Snapshot":
         return self._session.snapshot(), None if self._watchdog is None else self._watchdog.state
@@ -183,15 +187,17 @@ class _PoseOnly:
     fresh: SessionSnapshot
     maps: Float[Tensor, "1 c h w"]
     magnitude: Float[Tensor, "1 1 h w"]
-    cloth: Float[Tensor, "1 g 6"] | None
 
     def restart(self) -> NetworkOutput:
         """Drop the session's memory and return what the network makes of this frame as a first one."""
         self.session.restore(self.fresh)
-        return self.avatar.add_prior(self.session.step(self.maps, self.magnitude), self.cloth)
+        return self.session.step(self.maps, self.magnitude)
 
     def template(self) -> NetworkOutput:
-        """Drop the session's memory and return the output of a network that says nothing."""
+        """Drop the session's memory and return the output of a network that says nothing.
+
+        What is added to it is the motion prior alone, where there is one: it needs no network.
+        """
         self.session.restore(self.fresh)
         points = self.maps.new_zeros(1, len(self.avatar.garment_control_points()), 3)
         return self.avatar.offset_garment(points)

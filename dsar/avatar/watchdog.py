@@ -3,14 +3,14 @@
 A frame breaks where the output is not finite, far larger than any of training, or trembles as none of
 training does. Then the network's memory cannot be trusted: it is dropped, and the frame is made of the
 pose alone, as the first frame of a motion is. Where that breaks, too, it is the skinned template. So that
-nothing pops, what is shown glides there from the frame before.
+nothing pops, what is shown glides there from the frame before. An avatar's motion prior is beneath all of it.
 
 Only the frame itself and those before it decide. Without a finding the output is passed on as it is.
 """
 
 import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -38,6 +38,7 @@ class WatchdogState:
     """Share of the frame before in it."""
 
 
+@runtime_checkable
 class PoseOnly(Protocol):
     """Makes one frame of its pose alone; both ways leave the network without memory of any frame before."""
 
@@ -75,7 +76,8 @@ class Watchdog:
 
         Args:
             maps: The standardised input maps.
-            output: What the network made of them.
+            output: What the network made of them, without the motion prior: that is a simulation, which may
+                move a garment further than in training where the motion is wilder.
             pose_only: Makes the frame without what came before it.
         """
         found, jitter = self._find(maps, output)

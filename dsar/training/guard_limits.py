@@ -147,7 +147,7 @@ def _largest_outputs(avatar: Avatar, signal: DrivingSignal) -> dict[str, float]:
     player, jitter = Player(avatar, signal, guarded=False), Jitter.at_rate(avatar.fps)
     largest = {"offset": 0.0, "appearance": 0.0, "jitter": 0.0}
     for _ in range(len(signal)):
-        output = player.forward_frame().output
+        output = player.forward_frame().own
         offset = output.offset.clone()
         jitter = jitter.step(offset, float(jitter.change(offset)))
         found = {"offset": float(offset.abs().amax()), "appearance": float(output.appearance.abs().amax())}
