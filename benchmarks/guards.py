@@ -4,7 +4,7 @@
 
 Without a run the avatar is that of the preset `demo`, untrained: no guard is faster for what it sees. The
 watchdog is timed by itself, beside the frame that it watches, frame by frame: a difference of two rollouts
-would drown in the noise of the machine. Both are medians over the frames.
+would drown in the noise of the machine. All are medians over the frames, of the calling thread's own time.
 """
 
 # First, because it imports torch before dsar does; see raster.py.
@@ -53,20 +53,20 @@ def measure(avatar: Avatar, motion: Motion) -> dict[str, float]:
     watch, spent = player._watchdog.watch, []
 
     def timed(*arguments):
-        start = time.perf_counter()
+        start = time.thread_time()
         found = watch(*arguments)
-        spent.append(time.perf_counter() - start)
+        spent.append(time.thread_time() - start)
         return found
 
     player._watchdog.watch = timed
     frames, pictures = [], []
     for _ in range(len(motion)):
-        start = time.perf_counter()
+        start = time.thread_time()
         gaussians = player.step().gaussians
-        made = time.perf_counter()
+        made = time.thread_time()
         rasterize(gaussians, camera)
         frames.append(made - start)
-        pictures.append(time.perf_counter() - made)
+        pictures.append(time.thread_time() - made)
     times = {"frame": frames, "guards": spent, "picture": pictures}
     return {name: 1e3 * statistics.median(values) for name, values in times.items()}
 

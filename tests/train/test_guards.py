@@ -15,15 +15,16 @@ import dsar
 from dsar.avatar import driving
 from dsar.avatar.avatar import Avatar
 from dsar.avatar.charts import Atlas, body_chart
-from dsar.avatar.guard_limits import MARGIN
+from dsar.avatar.guard_limits import MARGIN, GuardLimits, Jitter
 from dsar.avatar.guards import Guard
 from dsar.avatar.player import Player
 from dsar.avatar.rollout import roll_out
-from dsar.avatar.watchdog import BLEND_SECONDS, REPLACING
+from dsar.avatar.watchdog import BLEND_SECONDS, REPLACING, Watchdog
 from dsar.body.files import load_body
 from dsar.cli import main
 from dsar.cli.export import Export
 from dsar.config import ModelConfig
+from dsar.network import NetworkOutput
 from dsar.training.checkpoint import Run, load_checkpoint
 from dsar.training.guard_limits import attach_guards, find_guard_limits, read_guard_limits
 from dsar.training.scene import open_scene
@@ -50,7 +51,7 @@ def sound() -> Avatar:
     """An avatar whose network says something, with guards."""
     torch.manual_seed(0)
     model = ModelConfig(channels=(4, 8), heads=2, window=2, memory=2)
-    made = Avatar(load_body(), Atlas.stack([body_chart(load_body(), 24)]), model, 30.0)
+    made = Avatar(load_body(), Atlas.stack([body_chart(load_body(), 32)]), model, 30.0)
     signal = made.driving_signal(sway())
     made.fit_input_statistics([signal])
     torch.nn.init.normal_(made.network.decoder.head.weight, std=0.02)
@@ -161,20 +162,32 @@ def test_nothing_pops_where_frames_are_replaced(avatar):
         last = frame.output.offset.clone()
 
 
-def test_trembling_offsets_are_caught(avatar):
-    """Single frames are within all that training shows; their order is not."""
-    player = Player(avatar, avatar.driving_signal(sway()))
-    step, sign = player._session.step, [1.0]
+class Still:
+    """Makes a frame of the pose alone that says nothing."""
 
-    def trembling(*inputs):
-        output = step(*inputs)
-        sign[0] *= -1
-        return dataclasses.replace(output, offset=sign[0] * output.offset)
+    def restart(self) -> NetworkOutput:
+        return NetworkOutput(torch.zeros(1, 3, 4, 4), torch.zeros(1, 8, 4, 4), ())
 
-    player._session.step = trembling
-    found = [player.forward_frame().guarded for _ in range(24)]
-    assert Guard.JITTER in set().union(*names(found))
-    assert not {Guard.SIZE, Guard.FINITE} & set().union(*names(found))
+    template = restart
+
+
+def test_trembling_offsets_are_caught():
+    """Each frame is within all that training shows; their order is not."""
+    maps, pattern = torch.zeros(1, 6, 4, 4), torch.rand(1, 3, 4, 4)
+    smooth = [math.sin(0.3 * frame) * pattern for frame in range(40)]
+    trembling = [0.5 * (-1) ** frame * pattern for frame in range(40)]
+    jitter, largest = Jitter.at_rate(30.0), 0.0
+    for offset in smooth:
+        jitter = jitter.step(offset, float(jitter.change(offset)))
+        largest = max(largest, jitter.size)
+    limits = GuardLimits(maps[0], torch.ones(2), 1.0, 1.0, largest)
+    found = {}
+    for name, offsets in (("smooth", smooth), ("trembling", trembling)):
+        watchdog = Watchdog(limits, 30.0, torch.device("cpu"))
+        outputs = [NetworkOutput(offset, torch.zeros(1, 8, 4, 4), ()) for offset in offsets]
+        found[name] = names(watchdog.watch(maps, output, Still())[1] for output in outputs)
+    assert not any(found["smooth"])
+    assert set().union(*found["trembling"]) == {Guard.JITTER}
 
 
 def cut() -> Motion:
