@@ -7,6 +7,7 @@ take less. The rasteriser alone is stood in for: its backends need values. What 
 import dataclasses
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -16,7 +17,7 @@ from dsar.avatar.bilinear import BilinearSampling, sample_bilinear
 from dsar.avatar.posing import pose_gaussians
 from dsar.avatar.template import SCALE_IN_TEXELS, GaussianParameters
 from dsar.body.skinning import blend_transforms
-from dsar.config import TrainConfig
+from dsar.config import ScheduleConfig, TrainConfig
 from dsar.metrics.lpips import Lpips
 from dsar.network import NetworkOutput, NetworkState, build_network
 from dsar.training.driving_maps import CAPACITY
@@ -83,6 +84,13 @@ def atlas_size(config: TrainConfig) -> tuple[int, int]:
     return atlas.resolution + atlas.garment_rows * (atlas.garment == "auto"), atlas.resolution
 
 
+_SCHEDULE = (
+    *("rollouts_per_worker", "rendered_fraction", "views", "chunk_frames"),
+    *("muon_rate", "recomputation"),
+)
+"""Settings of the schedule that an update's cost depends on."""
+
+
 class _ImitatedUpdate:
     """An update on the meta device, part by part."""
 
@@ -93,8 +101,9 @@ class _ImitatedUpdate:
         self.rendered = max(1, math.ceil(schedule.rendered_fraction * self.rollouts))
         rows, columns = atlas_size(config)
         texels = rows * columns
+        # Made in main memory: to draw weights on the meta device torch loads its compiler, for seconds.
+        self.network = build_network(config.model, torch.ones(size, dtype=torch.bool)).to(_META)
         with _META:
-            self.network = build_network(config.model, torch.ones(size, dtype=torch.bool))
             self.network.recomputes = schedule.recomputation == "on"
             tangents, hidden = torch.empty(texels, 3, 2), torch.zeros(texels, dtype=torch.bool)
             self.template = GaussianParameters(
@@ -241,4 +250,13 @@ def estimate_pairs(gaussians: int, view: tuple[int, int]) -> int:
 
 def cost_of_update(config: TrainConfig, view: tuple[int, int]) -> UpdateCost:
     """Return what an update of these settings costs one worker, on views of a height and width in pixels."""
+    schedule = {name: getattr(config.schedule, name) for name in _SCHEDULE}
+    what_counts = TrainConfig(
+        atlas=config.atlas, model=config.model, loss=config.loss, schedule=ScheduleConfig(**schedule)
+    )
+    return _imitated(what_counts, view)
+
+
+@lru_cache(maxsize=64)
+def _imitated(config: TrainConfig, view: tuple[int, int]) -> UpdateCost:
     return _ImitatedUpdate(config, view).run()

@@ -5,6 +5,7 @@ import os
 import re
 import shutil
 import signal
+import statistics
 import subprocess
 import sys
 import time
@@ -204,9 +205,11 @@ def test_two_workers_that_share_a_batch_are_one_within_rounding(tiny_capture, tm
     # A softmax does not see what is added to all of its scores: these have no gradient but rounding.
     names = [name for name in one if not name.endswith("attention.key.bias")]
     assert len(names) == len(one) - 2
-    for name in names:
-        difference, size = (one[name] - two[name]).double().norm(), one[name].double().norm()
-        assert difference <= 1e-3 * size, name
+    apart = {name: float((one[name] - two[name]).double().norm()) for name in names}
+    size = {name: float(one[name].double().norm()) for name in names}
+    # Adam makes steps of one length out of gradients that are hardly more than rounding.
+    assert [name for name in names if apart[name] > 0.03 * size[name]] == []
+    assert statistics.median(apart[name] / max(size[name], 1e-12) for name in names) < 1e-5
 
 
 @pytest.mark.usefixtures("no_pictures")
