@@ -198,17 +198,16 @@ def test_two_workers_that_share_a_batch_are_one_within_rounding(tiny_capture, tm
     for workers in (1, 2):
         share = ("rollouts-per-worker", 4 // workers), ("template-frames-per-worker", 8 // workers)
         flags = [text for name, value in share for text in (f"--schedule.{name}", str(value))]
-        options = ("--steps", "20", "--schedule.template-fraction", "0.25", "--workers", str(workers))
+        options = ("--steps", "12", "--schedule.template-fraction", "0.25", "--workers", str(workers))
         main(train_arguments(tiny_capture, tmp_path / str(workers), *options, *flags))
         runs.append(load_file(tmp_path / str(workers) / "checkpoint" / "avatar.safetensors"))
     one, two = runs
     # A softmax does not see what is added to all of its scores: these have no gradient but rounding.
     names = [name for name in one if not name.endswith("attention.key.bias")]
     assert len(names) == len(one) - 2
-    apart = {name: float((one[name] - two[name]).double().norm()) for name in names}
+    apart = {name: float((one[name].double() - two[name].double()).norm()) for name in names}
     size = {name: float(one[name].double().norm()) for name in names}
-    # Adam makes steps of one length out of gradients that are hardly more than rounding.
-    assert [name for name in names if apart[name] > 0.03 * size[name]] == []
+    assert [name for name in names if apart[name] > 1e-3 * size[name]] == []
     assert statistics.median(apart[name] / max(size[name], 1e-12) for name in names) < 1e-5
 
 
