@@ -16,6 +16,7 @@ _PUBLIC = {
     "load": "dsar.training.guard_limits",
     "roll_out": "dsar.avatar.rollout",
     "rasterize": "dsar.raster",
+    "rasterize_views": "dsar.raster",
 }
 
 
