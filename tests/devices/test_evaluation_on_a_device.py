@@ -15,7 +15,7 @@ from dsar.evaluation import heldout, profiling
 from dsar.evaluation import stress as battery
 from dsar.evaluation.looping import loop_motion
 from dsar.evaluation.profiling import time_rollout
-from dsar.evaluation.stress_motions import spin_and_stop, sway_motion
+from dsar.evaluation.stress.motions import spin_and_stop, sway_motion
 from dsar.metrics.lpips import Lpips
 from dsar.training.checkpoint import load_checkpoint
 from tests.devices.host_waits import watch

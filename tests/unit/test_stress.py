@@ -11,7 +11,7 @@ from dsar.avatar.charts import Atlas, body_chart
 from dsar.body.files import load_body
 from dsar.config import ModelConfig
 from dsar.evaluation import stress as battery
-from dsar.evaluation.stress_motions import spin_and_stop, sway_motion
+from dsar.evaluation.stress.motions import spin_and_stop, sway_motion
 from dsar.network import NetworkOutput
 from dsar.types import Motion
 
