@@ -12,7 +12,7 @@ from torch import Tensor
 from dsar.body.model import JOINT_NAMES
 from dsar.body.skinning import blend_transforms, forward_kinematics
 from dsar.data.motions.files import resample, rotate_motion
-from dsar.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
+from dsar.geometry.rotations import axis_angle_from_matrix, heading_matrix, matrix_from_axis_angle
 from dsar.types import Body, Motion
 
 _BODY_JOINTS = 22
@@ -160,7 +160,8 @@ class Key:
     joints: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
     """Axis-angles, degrees, of joints; all others are as at the start. X bends forward, Y turns, Z opens."""
     turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Axis-angle, degrees, by which the whole body is turned from where it was at the key before."""
+    """Axis-angle, degrees, by which the whole body is turned from where it was at the key before, in axes of
+    its first frame: X to its left, Y up, Z ahead."""
     hold: float = 0.0
     """Seconds that it stays."""
     lift: float = 0.0
@@ -173,6 +174,7 @@ def play_keys(motion: Motion, body: Body, keys: Sequence[Key], name: str) -> Mot
     The body's lowest point is on the ground, at y = 0, or as high above as the keys say.
     """
     pose, root, lift = motion.rotations[0].clone(), motion.rotations[0, 0], 0.0
+    heading = heading_matrix(matrix_from_axis_angle(root))
     rotations, lifts = [pose[None]], [torch.zeros(1)]
     for key in keys:
         goal = motion.rotations[0].clone()
@@ -182,7 +184,7 @@ def play_keys(motion: Motion, body: Body, keys: Sequence[Key], name: str) -> Mot
         part = torch.arange(1, steps + 1) / steps
         part = part * part * (3 - 2 * part)
         way = _between(pose, goal, part)
-        turn = torch.tensor(key.turn) * (math.pi / 180)
+        turn = heading @ (torch.tensor(key.turn) * (math.pi / 180))
         turned = matrix_from_axis_angle(part[:, None] * turn) @ matrix_from_axis_angle(root)
         way[:, 0] = axis_angle_from_matrix(turned)
         pose, root = way[-1].clone(), way[-1, 0]

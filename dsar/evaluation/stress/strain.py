@@ -73,6 +73,7 @@ class Strain:
         }
 
 
+@torch.no_grad()
 def measure_strain(avatar: Avatar, motion: Motion) -> Strain:
     """Return what a motion does to an avatar."""
     rollout, control = Rollout(avatar, motion), avatar.control
