@@ -23,7 +23,7 @@ class Stress(RunCommand):
     """Drive an avatar where rollouts fail; exit with 1 where a case does."""
 
     cases: tuple[str, ...] = ()
-    """Only these of the cases, by name, as `twin stop rate`; default: all."""
+    """Only these of the cases, by name, as `twin stop rate`; the run's page stays as it is. Default: all."""
 
     def output_folders(self) -> list[Path]:
         """Return the run, which keeps its verdicts and report."""
@@ -66,8 +66,9 @@ class Stress(RunCommand):
                 sys.stdout.write(line + "\n")
         sys.stdout.write(f"{battery.survived} of {len(cases)} passed\n")
         self.write_json(content)
-        write_text_atomically(run.stress, json.dumps(content, indent=2) + "\n")
-        write_report(run)
+        if not self.cases:
+            write_text_atomically(run.stress, json.dumps(content, indent=2) + "\n")
+            write_report(run)
         if battery.survived < len(cases):
             raise SystemExit(1)
 

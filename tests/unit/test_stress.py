@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import math
-from functools import partial
 
 import pytest
 import torch
@@ -13,11 +12,13 @@ from dsar.avatar.charts import Atlas, body_chart
 from dsar.avatar.rollout import roll_out
 from dsar.body.files import load_body
 from dsar.config import ModelConfig
+from dsar.errors import MotionError
 from dsar.evaluation import stress as battery
 from dsar.evaluation.stress import memory
 from dsar.evaluation.stress.motions import spin_and_stop, sway_motion
 from dsar.evaluation.stress.rollouts import Rollout
 from dsar.types import Motion
+from tests.brief_battery import CASES, shorten_motions
 
 FPS = 30.0
 
@@ -144,10 +145,9 @@ def test_a_sway_is_periodic_and_begins_at_rest(motion):
     torch.testing.assert_close(sway.rotations[60:120], sway.rotations[120:180], atol=1e-5, rtol=0)
 
 
-def test_every_case_says_what_it_found_why_and_when(avatar, motion):
-    small = {"long": partial(battery.run_long, frames=1), "cycle": partial(battery.run_cycle, cycles=6)}
-    brief = motion.slice(0, 24)
-    found = dict(battery.stress(avatar, brief, battery.CASES | small))
+def test_every_case_says_what_it_found_why_and_when(avatar, motion, monkeypatch):
+    shorten_motions(monkeypatch)
+    found = dict(battery.stress(avatar, motion.slice(0, 12), CASES))
     assert list(found) == list(battery.CASES)
     for name, verdict in found.items():
         assert math.isfinite(verdict.value), name
@@ -166,6 +166,11 @@ def test_every_case_says_what_it_found_why_and_when(avatar, motion):
     assert json.loads(json.dumps(content)) == content
     assert content["tried"] == len(battery.CASES) == 19
     assert {"pass", "value", "threshold"} <= content["cases"]["gap"].keys()
+
+
+def test_a_motion_that_is_too_short_is_told(avatar, motion):
+    with pytest.raises(MotionError, match="motion wave has 3 frames, the battery needs 4"):
+        next(battery.stress(avatar, motion.slice(0, 3)))
 
 
 def test_a_moment_is_the_rollout_s_own_frames(avatar, motion):

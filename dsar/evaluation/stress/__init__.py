@@ -18,8 +18,11 @@ from dsar.evaluation.stress.strain import (
     run_shear,
 )
 from dsar.evaluation.stress.verdicts import BatteryVerdict, Case, CaseVerdict, Moment
+from dsar.errors import MotionError
 from dsar.types import Motion
 
+LEAST_FRAMES = 4
+"""Of the motion from which all cases are made."""
 CASES: Mapping[str, Case] = {
     "long": run_long,
     "cycle": run_cycle,
@@ -47,7 +50,16 @@ CASES: Mapping[str, Case] = {
 def stress(
     avatar: Avatar, motion: Motion, cases: Mapping[str, Case] = CASES
 ) -> Iterator[tuple[str, CaseVerdict]]:
-    """Yield the verdict of each case on a motion at the avatar's frame rate."""
+    """Yield the verdict of each case on a motion at the avatar's frame rate.
+
+    Raises:
+        MotionError: the motion is too short to stop, to leave out frames of, or to part in its middle.
+    """
+    if len(motion) < LEAST_FRAMES:
+        raise MotionError(
+            f"motion {motion.name} has {len(motion)} frames, the battery needs {LEAST_FRAMES} or more: give the "
+            "capture a longer test sequence"
+        )
     for name, case in cases.items():
         yield name, case(avatar, motion)
 

@@ -41,7 +41,7 @@ def run_teleport(avatar: Avatar, motion: Motion) -> CaseVerdict:
         "a 4K picture shows",
         curve=rounded(apart),
         frame=worst,
-        moment=there.moment(len(motion) // 2),
+        moment=there.moment(worst),
     )
 
 
@@ -64,8 +64,8 @@ def run_causal(avatar: Avatar, motion: Motion) -> CaseVerdict:
         "rollout before it",
         curve=rounded(apart),
         present=bool(apart[part:].amax() > 0),
-        frame=worst_of(apart[:part]),
-        moment=other.moment(part),
+        frame=(worst := worst_of(apart[:part])),
+        moment=other.moment(worst),
     )
 
 

@@ -204,5 +204,5 @@ def run_stop(avatar: Avatar, motion: Motion) -> CaseVerdict:
         curve=rounded(residual),
         present=present,
         frame=worst,
-        moment=rollout.moment(stop + 4),
+        moment=rollout.moment(worst),
     )
