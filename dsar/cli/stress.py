@@ -49,7 +49,9 @@ class Stress(RunCommand):
         scene = open_scene(run, config)
         motion = scene.motions[resolve_sequence(scene, "test") or ""]
         cases, seconds, start = {}, {}, time.perf_counter()
-        for name, verdict in track_progress(stress(avatar, motion, chosen), len(chosen), self.progress, "stress"):
+        for name, verdict in track_progress(
+            stress(avatar, motion, chosen), len(chosen), self.progress, "stress"
+        ):
             cases[name], seconds[name] = verdict, time.perf_counter() - start
             outcome = "passed" if verdict.passed else "FAILED"
             sys.stdout.write(f"{name:9s} {outcome}  {verdict.describe()}  ({seconds[name]:.0f} s)\n")

@@ -1,10 +1,11 @@
-"""The stability battery: what a rollout does where rollouts fail. It needs no truth and no licensed motion."""
+"""The stability battery: what a rollout does where rollouts fail. It needs no truth and no licence."""
 
 from collections.abc import Iterator, Mapping
 
 import torch
 
 from dsar.avatar.avatar import Avatar
+from dsar.errors import MotionError
 from dsar.evaluation.stress.invariance import run_causal, run_noise, run_rate, run_teleport
 from dsar.evaluation.stress.memory import run_cold, run_cycle, run_gap, run_long, run_stop, run_twin
 from dsar.evaluation.stress.pictures import run_empty, run_precision
@@ -18,7 +19,6 @@ from dsar.evaluation.stress.strain import (
     run_shear,
 )
 from dsar.evaluation.stress.verdicts import BatteryVerdict, Case, CaseVerdict, Moment
-from dsar.errors import MotionError
 from dsar.types import Motion
 
 LEAST_FRAMES = 4
@@ -57,16 +57,38 @@ def stress(
     """
     if len(motion) < LEAST_FRAMES:
         raise MotionError(
-            f"motion {motion.name} has {len(motion)} frames, the battery needs {LEAST_FRAMES} or more: give the "
-            "capture a longer test sequence"
+            f"motion {motion.name} has {len(motion)} frames, the battery needs {LEAST_FRAMES} or more: give "
+            "the capture a longer test sequence"
         )
     for name, case in cases.items():
         yield name, case(avatar, motion)
 
 
 __all__ = [
-    "CASES", "BatteryVerdict", "Case", "CaseVerdict", "Moment", "stress",
-    *("run_causal", "run_cold", "run_contact", "run_cycle", "run_empty", "run_extreme", "run_floor"),
-    *("run_gap", "run_long", "run_noise", "run_ood", "run_precision", "run_prior", "run_rate"),
-    *("run_scale", "run_shear", "run_stop", "run_teleport", "run_twin"),
-]  # fmt: skip
+    "CASES",
+    "LEAST_FRAMES",
+    "BatteryVerdict",
+    "Case",
+    "CaseVerdict",
+    "Moment",
+    "run_causal",
+    "run_cold",
+    "run_contact",
+    "run_cycle",
+    "run_empty",
+    "run_extreme",
+    "run_floor",
+    "run_gap",
+    "run_long",
+    "run_noise",
+    "run_ood",
+    "run_precision",
+    "run_prior",
+    "run_rate",
+    "run_scale",
+    "run_shear",
+    "run_stop",
+    "run_teleport",
+    "run_twin",
+    "stress",
+]

@@ -54,7 +54,7 @@ class Analysis:
     """What can be said of an avatar's stability by its equations and small errors."""
 
     loop_gain: Mapping[str, Gain]
-    """By stream: `offsets` (d offsets / d previous offsets), `memory` (d h / d previous h), where it has it."""
+    """By stream: `offsets` (d offsets / d previous offsets), and `memory` (d h / d previous h) of a bank."""
     lyapunov: Mapping[str, float]
     """By motion: the finite-time exponent, 1/s; negative where errors die out."""
     half_life: float
@@ -132,8 +132,8 @@ def loop_gains(avatar: Avatar, motion: Motion) -> dict[str, Gain]:
 def lyapunov_exponent(avatar: Avatar, motion: Motion) -> float:
     """Return the largest finite-time exponent of twins that are nudged at three frames, 1/s.
 
-    A twin's offsets are 1 mm (rms) wrong; ln(distance / first distance) over the time, until it is a hundredth
-    or the motion ends. Minus infinity where nothing is left after a frame.
+    A twin's offsets are 1 mm (rms) wrong; ln(distance / first distance) over the time, until it is a
+    hundredth or the motion ends. Minus infinity where a motion has no frame to be nudged in.
     """
     starts = sorted({max(1, share * len(motion) // 8) for share in (1, 3, 5)} & set(range(len(motion) - 1)))
     nudged = _nudged_distances(avatar, motion, starts)
@@ -203,7 +203,7 @@ def half_life(avatar: Avatar, motion: Motion) -> float:
 
 @torch.no_grad()
 def settle_after_spin(avatar: Avatar, motion: Motion) -> tuple[float, float]:
-    """Return the seconds in which the garment settles after a spin that stops at once, and its overshoot, mm."""
+    """Return the seconds in which the garment settles after a spin that stops, and its overshoot, mm."""
     spin, stop = spin_and_stop(motion)
     points = avatar.garment_control_points()
     offsets = roll_offsets(avatar, spin)
@@ -269,7 +269,8 @@ def describe_analysis(analysis: Analysis) -> list[str]:
     worst = max(analysis.lyapunov, key=lambda name: analysis.lyapunov[name])
     return [
         f"loop gain (below 1 small errors die out): {gains}",
-        f"Lyapunov exponent, largest of {len(analysis.lyapunov)} motions: {analysis.lyapunov[worst]:.1f} per s ({worst})",
-        f"a dent of 2 cm is half as deep after {analysis.half_life:.2f} s; after a spin the garment settles in "
-        f"{analysis.settle:.2f} s and swings on by {analysis.overshoot:.0f} mm",
+        f"Lyapunov exponent, largest of {len(analysis.lyapunov)} motions: {analysis.lyapunov[worst]:.1f} "
+        f"per s ({worst}); negative: errors die out",
+        f"a dent of 2 cm is half as deep after {analysis.half_life:.2f} s; after a spin the garment settles "
+        f"in {analysis.settle:.2f} s and swings on by {analysis.overshoot:.0f} mm",
     ]

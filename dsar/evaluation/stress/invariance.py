@@ -1,4 +1,4 @@
-"""Cases of what must not matter: where a body is, what comes later, at which rate and how well it was captured."""
+"""Cases of what must not matter: where a body is, what comes later, its frame rate, noise of its capture."""
 
 import torch
 from jaxtyping import Float
@@ -37,8 +37,8 @@ def run_teleport(avatar: Avatar, motion: Motion) -> CaseVerdict:
         value=sound(apart.amax(), apart),
         threshold=0.1,
         unit="mm",
-        reason="a cut is taken out before the network sees it, so that only rounding is left: a tenth of what "
-        "a 4K picture shows",
+        reason="a cut is taken out before the network sees it, so that only rounding is left: a tenth of "
+        "what a 4K picture shows",
         curve=rounded(apart),
         frame=worst,
         moment=there.moment(worst),
@@ -60,8 +60,8 @@ def run_causal(avatar: Avatar, motion: Motion) -> CaseVerdict:
         value=sound(apart[:part].amax()),
         threshold=0.0,
         unit="mm",
-        reason="the same past gives the same bits, or a rollout depends on what has not happened yet, or on another "
-        "rollout before it",
+        reason="the same past gives the same bits, or a rollout depends on what has not happened yet, or on "
+        "another rollout before it",
         curve=rounded(apart),
         present=bool(apart[part:].amax() > 0),
         frame=(worst := worst_of(apart[:part])),
@@ -99,11 +99,11 @@ def run_noise(avatar: Avatar, motion: Motion) -> CaseVerdict:
 
 
 def run_rate(avatar: Avatar, motion: Motion) -> CaseVerdict:
-    """The same motion at 15, 60 and 120 frames a second, resampled to the avatar's: how much more cloth moves.
+    """The same motion at 15, 60 and 120 frames a second, resampled: how much more cloth moves.
 
     At 15 a second every other pose is lost, and resampling puts the body itself elsewhere. So the garment's
     rms difference counts only beyond what the resampling itself costs: beyond the difference of its points
-    under skinning alone, and of cloth that is simulated on both motions where the avatar has a prior (of which
+    under skinning alone, and of cloth that is simulated on both motions where the avatar has a prior (which
     the case `prior` judges). Velocities must be the same at twice the rate, or their unit is wrong. The curve
     is the whole difference at each rate, mm.
     """
@@ -131,8 +131,8 @@ def run_rate(avatar: Avatar, motion: Motion) -> CaseVerdict:
         value=sound(beyond.amax(), distances),
         threshold=2.0,
         unit="mm",
-        reason="resampling moves the body, cloth that stays behind moves against it by as much, and cloth that is "
-        "simulated by a little more: that is no fault of the model; two millimetres beyond it would be",
+        reason="resampling moves the body, cloth that stays behind moves against it by as much, and cloth "
+        "that is simulated by a little more: no fault of the model; two millimetres beyond it would be",
         curve=rounded(distances),
         present=0.8 < ratio < 1.25,
         frame=worst,
@@ -154,7 +154,7 @@ def _simulated_apart(avatar: Avatar, motion: Motion, other: Motion) -> Float[Ten
 
 
 def _velocity_ratio(avatar: Avatar, motion: Motion) -> float:
-    """Return the mean speed that the network sees at twice the rate, over that at the avatar's; 1 if sound."""
+    """Return the mean speed that the network sees at twice the rate, over that at the avatar's."""
     means = []
     for rate in (1, 2):
         signal = avatar.driving_signal(resample(motion, rate * motion.fps))

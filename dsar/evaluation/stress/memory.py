@@ -30,7 +30,7 @@ _MOVING_SHARE = 0.05
 GAPS = (1, 2, 5, 10)
 """Frames in a row that are missing."""
 SECOND_RUN = 10.0
-"""Millimetres, rms, by which two true runs of one motion may differ: cloth that starts otherwise folds otherwise."""
+"""Millimetres, rms, by which two true runs of a motion may differ: cloth that starts otherwise folds so."""
 
 
 def run_long(avatar: Avatar, motion: Motion, frames: int = 10_000) -> CaseVerdict:
@@ -145,8 +145,8 @@ def run_cold(avatar: Avatar, motion: Motion) -> CaseVerdict:
         value=sound(burn_in.amax(), apart),
         threshold=3.0,
         unit="s",
-        reason="a shot has no more than three seconds of handles before its first frame; then cloth must be as "
-        "near as a second true run of the same motion is (9 mm on the demo's spin)",
+        reason="a shot has no more than three seconds of handles before its first frame; then cloth must "
+        "be as near as a second true run of the same motion is (9 mm on the demo's spin)",
         curve=rounded(apart.amax(0)),
         frame=worst,
         details={"seconds_to_1_mm": exactly},
@@ -199,8 +199,8 @@ def run_stop(avatar: Avatar, motion: Motion) -> CaseVerdict:
         value=sound(late.amax(), offsets),
         threshold=1.0,
         unit="mm",
-        reason="three seconds after a stop a skirt hangs still; a millimetre is a pixel of a person who fills "
-        "the height of a 4K picture",
+        reason="three seconds after a stop a skirt hangs still; a millimetre is a pixel of a person who "
+        "fills the height of a 4K picture",
         curve=rounded(residual),
         present=present,
         frame=worst,

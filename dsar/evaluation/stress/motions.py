@@ -78,7 +78,7 @@ def change_future(motion: Motion, frame: int) -> Motion:
 def fastest_gap(motion: Motion, count: int) -> int:
     """Return where `count` frames can be missing while the body is fastest.
 
-    In the gap no joint turns by more than `_MOST_TURN`: beyond half a turn there is no shortest way to fill it.
+    In the gap no joint turns by more than `_MOST_TURN`: beyond half a turn none could fill it.
     """
     first = matrix_from_axis_angle(motion.rotations[: max(1, len(motion) - count - 1), :_BODY_JOINTS])
     last = matrix_from_axis_angle(motion.rotations[count + 1 :, :_BODY_JOINTS])
@@ -102,7 +102,10 @@ def fill_gap(motion: Motion, start: int, count: int) -> Motion:
     ends = torch.tensor([max(start - 1, 0), end])
     span = max(1, int(ends[1] - ends[0]))
     pair = dataclasses.replace(
-        motion, rotations=motion.rotations[ends], translations=motion.translations[ends], fps=motion.fps / span
+        motion,
+        rotations=motion.rotations[ends],
+        translations=motion.translations[ends],
+        fps=motion.fps / span,
     )
     way = resample(pair, motion.fps)
     rotations, translations = motion.rotations.clone(), motion.translations.clone()

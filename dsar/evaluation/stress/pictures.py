@@ -48,7 +48,7 @@ def camera_at(
 
 
 def run_precision(avatar: Avatar, motion: Motion) -> CaseVerdict:
-    """The same rollout in other precisions, and by training's own path: rms difference of pictures, grey levels.
+    """The same rollout in other precisions, and by training's path: rms difference of pictures, grey levels.
 
     bfloat16 against float32, and where the avatar is on a GPU, float32 on the CPU. The curve is the largest
     difference by picture, every sixth frame of the first two seconds.

@@ -1,4 +1,4 @@
-"""The case of the motion prior: whether the simulation that the default stands on comes to rest and stays whole."""
+"""The case of the motion prior: whether the simulation that the default stands on comes to rest."""
 
 import torch
 
@@ -12,13 +12,13 @@ from dsar.types import Motion
 REST_SECONDS = 6.0
 """Time that the body stands at the end of each motion."""
 _REASON = (
-    "three seconds after a body stands, simulated cloth hangs as it will: a prior that swings on, or that crumples "
-    "and does not come home, would drag the network with it; five millimetres are within what the network mends"
+    "three seconds after a body stands, simulated cloth hangs as it will: a prior that swings on, or that "
+    "crumples, would drag the network with it; five millimetres are within what the network mends"
 )
 
 
 def run_prior(avatar: Avatar, motion: Motion) -> CaseVerdict:
-    """The prior alone after a spin, a fall and acrobatics: rms way from where it ends up, 3 s after the last move.
+    """The prior alone after a spin, a fall and acrobatics: rms way from where it ends up, 3 s later.
 
     An avatar without a prior passes with 0. The curve is the way from the end after the spin, mm.
     """

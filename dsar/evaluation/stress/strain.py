@@ -35,8 +35,8 @@ _LEAST_EDGE = 0.005
 """Metres: shorter edges at rest count as this long."""
 _UNIT = "of what breaks a picture"
 _REASON = (
-    "1 is where 0.1 % of the garment's edges are four times as long as at rest, a point moves against the body by "
-    "12 m/s, or a Gaussian swells to the size of a hand (90 mm)"
+    "1 is where 0.1 % of the garment's edges are four times as long as at rest, a point moves against the "
+    "body by 12 m/s, or a Gaussian swells to the size of a hand (90 mm)"
 )
 
 
@@ -126,7 +126,7 @@ def run_extreme(avatar: Avatar, motion: Motion) -> CaseVerdict:
 
 
 def run_floor(avatar: Avatar, motion: Motion) -> CaseVerdict:
-    """A body that kneels, sits, falls, lies and rolls: how near to broken. The curve is the worst of a frame."""
+    """A body that kneels, sits, falls, lies and rolls: how near to broken. The curve is by frame."""
     body = avatar.body.to(device="cpu")
     return _judge([measure_strain(avatar, play_keys(motion, body, poses.FLOOR, "floor"))], {})
 
@@ -134,8 +134,8 @@ def run_floor(avatar: Avatar, motion: Motion) -> CaseVerdict:
 def run_scale(avatar: Avatar, motion: Motion) -> CaseVerdict:
     """The motion of a smaller and of a larger person: how near to broken.
 
-    Steps and hips are 0.8 and 1.25 times what the avatar's legs make, as where a motion of another body is not
-    fitted. The curve is the worst at each factor.
+    Steps and hips are 0.8 and 1.25 times what the avatar's legs make, as where a motion of another body is
+    not fitted. The curve is the worst at each factor.
     """
     body = avatar.body.to(device="cpu")
     found = [measure_strain(avatar, scale_motion(motion, body, factor)) for factor in FACTORS]
@@ -174,8 +174,8 @@ def run_contact(avatar: Avatar, motion: Motion) -> CaseVerdict:
         value=sound(100 * found.inside.mean(), found.offset, found.stretch),
         threshold=10.0,
         unit="% inside",
-        reason="skinning alone puts the skirt of a squatting body into its thighs; where a tenth of it is inside, "
-        "skin shows through in most frames",
+        reason="skinning alone puts the skirt of a squatting body into its thighs; where a tenth of it is "
+        "inside, skin shows through in most frames",
         curve=rounded(100 * found.inside),
         frame=worst,
         details=found.details(),
