@@ -9,7 +9,8 @@ from dsar.evaluation.looping import loop_motion
 from dsar.evaluation.stress import memory, poses, prior, strain
 from dsar.evaluation.stress.motions import Key, spin_and_stop, sway_motion, wander_poses
 
-CASES = battery.CASES | {
+CASES = {
+    **battery.CASES,
     "long": partial(battery.run_long, frames=1),
     "cycle": partial(battery.run_cycle, cycles=6),
     "twin": partial(battery.run_twin, start=3),

@@ -4,6 +4,7 @@ A rollout is a loop: offsets and hidden states go into the next frame. Where sma
 frame to frame it is stable on that motion, whatever the errors are.
 """
 
+import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -117,10 +118,10 @@ def loop_gains(avatar: Avatar, motion: Motion) -> dict[str, Gain]:
         return output.offset, after.memory[:, -1]
 
     def by_offsets(newest: Tensor) -> Tensor:
-        return step(_with_newest(before, "offsets", newest))[0]
+        return step(dataclasses.replace(before, offsets=_with_newest(before.offsets, newest)))[0]
 
     def by_memory(newest: Tensor) -> Tensor:
-        return step(_with_newest(before, "memory", newest))[1]
+        return step(dataclasses.replace(before, memory=_with_newest(before.memory, newest)))[1]
 
     gains = {"offsets": _spectral_norm(by_offsets, before.offsets[:, -1])}
     if avatar.network.bank is not None:
@@ -226,13 +227,9 @@ def _stacked(states: list[NetworkState]) -> NetworkState:
     )
 
 
-def _with_newest(state: NetworkState, name: str, newest: Tensor) -> NetworkState:
-    """Return a state in which the newest entry of a stream is another."""
-    entries = torch.cat([getattr(state, name)[:, :-1], newest[:, None]], 1)
-    return NetworkState(**({field: getattr(state, field) for field in _FIELDS} | {name: entries}))
-
-
-_FIELDS = ("fresh", "window", "motion", "offsets", "memory")
+def _with_newest(entries: Tensor, newest: Tensor) -> Tensor:
+    """Return a stream's entries of which the newest is another."""
+    return torch.cat([entries[:, :-1], newest[:, None]], 1)
 
 
 def _spectral_norm(function: Callable[[Tensor], Tensor], at: Float[Tensor, "b *s"]) -> Float[Tensor, " b"]:
