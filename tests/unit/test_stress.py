@@ -101,7 +101,8 @@ def test_cloth_must_move_on_after_a_stop_and_then_come_to_rest(avatar, motion, p
     assert not battery.run_stop(avatar, motion).present
 
 
-def test_twins_meet_where_the_state_is_forgotten_and_only_there(avatar, motion):
+def test_twins_meet_where_the_state_is_forgotten_and_only_there(avatar, motion, monkeypatch):
+    shorten_motions(monkeypatch)
     assert battery.run_twin(avatar, motion).curve[0] > 0
     blind = Avatar(load_body(), Atlas.stack([body_chart(load_body(), 16)]), avatar.model, FPS).eval()
     assert battery.run_twin(blind, motion).value == 0

@@ -69,13 +69,13 @@ EXTREME = (
     Key(0.3, _ARMS_DOWN | {"left_hip": (-115.0, 0.0, 0.0)}, hold=0.2),
     Key(0.3, _ARMS_DOWN | {"right_hip": (0.0, 0.0, -90.0), "spine1": (0.0, 0.0, -25.0)}, hold=0.2),
     Key(0.4, _legs(120.0, 145.0) | _ARMS_UP, hold=0.2),
-    Key(0.25, _ARMS_UP | _legs(90.0, 110.0), turn=(-120.0, 0.0, 0.0), lift=0.6),
-    Key(0.25, _ARMS_UP | _legs(110.0, 120.0), turn=(-120.0, 0.0, 0.0), lift=0.7),
-    Key(0.25, _ARMS_UP | _legs(20.0, 30.0), turn=(-120.0, 0.0, 0.0), lift=0.0),
+    Key(0.4, _ARMS_UP | _legs(90.0, 110.0), turn=(-120.0, 0.0, 0.0), lift=0.25),
+    Key(0.4, _ARMS_UP | _legs(110.0, 120.0), turn=(-120.0, 0.0, 0.0), lift=0.2),
+    Key(0.4, _ARMS_UP | _legs(20.0, 30.0), turn=(-120.0, 0.0, 0.0)),
     Key(0.4, _legs(0.0, 0.0, 50.0) | _ARMS_UP, turn=(0.0, 0.0, 120.0)),
     Key(0.3, _legs(0.0, 0.0, 50.0) | _ARMS_UP, turn=(0.0, 0.0, 120.0)),
     Key(0.4, _legs(0.0, 0.0, 30.0) | _ARMS_UP, turn=(0.0, 0.0, 120.0), hold=0.2),
-    *(Key(0.12, _ARMS_CROSSED, turn=(0.0, 120.0, 0.0)) for _ in range(9)),
+    Key(1.6, _ARMS_CROSSED, turn=(0.0, 1080.0, 0.0)),
     Key(0.5, _ARMS_DOWN, hold=1.0),
 )
-"""Kicks to the limits of a hip, a squat, a backflip, a cartwheel, three turns at 2.8 a second."""
+"""Kicks to the limits of a hip, a squat, a backflip, a cartwheel, three turns, up to 2.8 a second."""
