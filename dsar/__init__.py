@@ -16,6 +16,7 @@ _PUBLIC = {
     "load": "dsar.training.checkpoint",
     "roll_out": "dsar.avatar.rollout",
     "rasterize": "dsar.raster",
+    "rasterize_views": "dsar.raster",
 }
 
 

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import torch
 from torch import Tensor, nn
@@ -12,7 +13,7 @@ from dsar.training.operation_meter import Operation
 _CHANNELS, _SIDE = 64, 64
 _IMAGES = (4, 256)
 """Fewest and most images of a measured convolution: a CPU is busy with four of them, a GPU is not."""
-_ENOUGH_S, _MOST_RUNS = 0.15, 200
+_ENOUGH_S, _MOST_RUNS = 0.06, 200
 _SHORT_S = 2e-3
 """A run that takes less is made larger, if it may."""
 _FLOAT_BYTES = 4
@@ -43,8 +44,9 @@ class DeviceRates:
         )
 
 
+@lru_cache
 def measure_rates(device: torch.device) -> DeviceRates:
-    """Measure a device, on one thread."""
+    """Measure a device, on one thread and once in a process."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

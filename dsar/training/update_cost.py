@@ -7,6 +7,7 @@ take less. The rasteriser alone is stood in for: its backends need values. What 
 import dataclasses
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -16,7 +17,7 @@ from dsar.avatar.bilinear import BilinearSampling, sample_bilinear
 from dsar.avatar.posing import pose_gaussians
 from dsar.avatar.template import SCALE_IN_TEXELS, GaussianParameters
 from dsar.body.skinning import blend_transforms
-from dsar.config import TrainConfig
+from dsar.config import ScheduleConfig, TrainConfig
 from dsar.metrics.lpips import Lpips
 from dsar.network import NetworkOutput, NetworkState, build_network
 from dsar.training.driving_maps import CAPACITY
@@ -83,6 +84,13 @@ def atlas_size(config: TrainConfig) -> tuple[int, int]:
     return atlas.resolution + atlas.garment_rows * (atlas.garment == "auto"), atlas.resolution
 
 
+_SCHEDULE = (
+    *("rollouts_per_worker", "rendered_fraction", "views", "chunk_frames"),
+    *("muon_rate", "recomputation"),
+)
+"""Settings of the schedule that an update's cost depends on."""
+
+
 class _ImitatedUpdate:
     """An update on the meta device, part by part."""
 
@@ -93,8 +101,9 @@ class _ImitatedUpdate:
         self.rendered = max(1, math.ceil(schedule.rendered_fraction * self.rollouts))
         rows, columns = atlas_size(config)
         texels = rows * columns
+        # Made in main memory: to draw weights on the meta device torch loads its compiler, for seconds.
+        self.network = build_network(config.model, torch.ones(size, dtype=torch.bool)).to(_META)
         with _META:
-            self.network = build_network(config.model, torch.ones(size, dtype=torch.bool))
             self.network.recomputes = schedule.recomputation == "on"
             tangents, hidden = torch.empty(texels, 3, 2), torch.zeros(texels, dtype=torch.bool)
             self.template = GaussianParameters(
@@ -192,32 +201,41 @@ class _ImitatedUpdate:
         (height, width), config = self.view, self.config
         camera, targets = Camera(torch.eye(3), torch.eye(4), width, height, "view"), []
         with self.meter.part(RASTERIZER):
-            images = [self._draw(frame) for frame in gaussians for _ in range(config.schedule.views)]
+            images = self._draw(gaussians)
         with self.meter.part(IMAGES), _META:
             for _ in images:
                 targets.append(Target(torch.empty(height, width, 3), torch.empty(height, width), camera))
             backgrounds = torch.empty(len(images), 3)
             return image_losses(images, targets, backgrounds, config.loss, self.lpips)[0].sum()
 
-    def _draw(self, gaussians: Gaussians) -> RenderOutput:
-        fields = [getattr(gaussians, field.name) for field in dataclasses.fields(Gaussians)]
-        color, alpha, depth = _ImitatedDrawing.apply(self.view, *fields)  # pyright: ignore
-        return RenderOutput(color, alpha, depth, torch.empty((), dtype=torch.int64, device=_META))
+    def _draw(self, gaussians: list[Gaussians]) -> list[RenderOutput]:
+        """Return the views of all frames, drawn in one call."""
+        names = [field.name for field in dataclasses.fields(Gaussians)]
+        fields = [torch.cat([getattr(frame, name) for frame in gaussians]) for name in names]
+        count = len(gaussians) * self.config.schedule.views
+        drawn = _ImitatedDrawing.apply(self.view, len(gaussians), count, *fields)  # pyright: ignore
+        culled = torch.empty((), dtype=torch.int64, device=_META)
+        colors, alphas, depths = (image.unbind() for image in drawn)
+        parts = zip(colors, alphas, depths, strict=True)
+        return [RenderOutput(color, alpha, depth, culled) for color, alpha, depth in parts]
 
 
 class _ImitatedDrawing(torch.autograd.Function):
-    """Takes what the Warp backend takes of a view, and as long."""
+    """Takes what the Warp backend takes of views of as many sets of Gaussians, and as long."""
 
     @staticmethod
-    def forward(ctx: Any, view: tuple[int, int], *fields: Tensor) -> tuple[Tensor, ...]:
-        count, pairs, empty = len(fields[0]), estimate_pairs(len(fields[0]), view), fields[0].new_empty
+    def forward(
+        ctx: Any, view: tuple[int, int], sets: int, views: int, *fields: Tensor
+    ) -> tuple[Tensor, ...]:
+        gaussians, empty = len(fields[0]) // sets, fields[0].new_empty
+        count, pairs = gaussians * views, estimate_pairs(gaussians, view) * views
         records, drawable = empty(count, _RECORD_SIZE), empty(count, dtype=torch.int32)
         ends, keys = empty(count, dtype=torch.int64), empty(pairs, dtype=torch.int64)
         places, owners = torch.empty_like(keys), empty(pairs, dtype=torch.int32)
         # A sort has its result beside its input.
         _, listed = torch.empty_like(keys), torch.empty_like(owners)
-        color, alpha, depth, passed = (empty(*view, *more) for more in ((3,), (), (), ()))
-        ctx.save_for_backward(*fields, depth, passed, empty(view, dtype=torch.int32))
+        color, alpha, depth, passed = (empty(views, *view, *more) for more in ((3,), (), (), ()))
+        ctx.save_for_backward(*fields, depth, passed, empty(views, *view, dtype=torch.int32))
         ctx.splats = records, drawable, ends, places, listed
         return color, alpha, depth
 
@@ -225,7 +243,7 @@ class _ImitatedDrawing(torch.autograd.Function):
     def backward(ctx: Any, *v_images: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         fields, (records, *_, listed) = ctx.saved_tensors[:5], ctx.splats
         _ = records.new_empty(len(listed), _RECORD_SIZE), torch.empty_like(records)
-        return None, *(torch.empty_like(field) for field in fields)
+        return None, None, None, *(torch.empty_like(field) for field in fields)
 
 
 def estimate_pairs(gaussians: int, view: tuple[int, int]) -> int:
@@ -241,4 +259,13 @@ def estimate_pairs(gaussians: int, view: tuple[int, int]) -> int:
 
 def cost_of_update(config: TrainConfig, view: tuple[int, int]) -> UpdateCost:
     """Return what an update of these settings costs one worker, on views of a height and width in pixels."""
+    schedule = {name: getattr(config.schedule, name) for name in _SCHEDULE}
+    what_counts = TrainConfig(
+        atlas=config.atlas, model=config.model, loss=config.loss, schedule=ScheduleConfig(**schedule)
+    )
+    return _imitated(what_counts, view)
+
+
+@lru_cache(maxsize=64)
+def _imitated(config: TrainConfig, view: tuple[int, int]) -> UpdateCost:
     return _ImitatedUpdate(config, view).run()

@@ -1,7 +1,9 @@
 """A run of format 3, as the revision wrote it in which tensors had other names: it plays and goes on alike.
 
 tests/data/run-format-3.zip holds a small run of the embedded capture without the body's own arrays, which the
-package embeds, and what that revision computed from it: Gaussians, maps, and the losses after `--resume`.
+package embeds, and what that revision computed from it: Gaussians and maps. The losses after `--resume` are
+of the first revision that gave each rollout random numbers of its own; the one before it still had those of
+format 3.
 """
 
 import json
