@@ -1,7 +1,7 @@
 """What training shows of input maps and outputs: the measures by which rollouts are guarded.
 
 Every limit is training's own largest, found by rolling the trained avatar out over its training motions; no
-limit is a number of ours. Guards act from `MARGIN` times that on, so that they cannot act on those motions.
+limit is a number of ours. Guards act from some times that on, so that they cannot act on those motions.
 """
 
 import math
@@ -13,8 +13,11 @@ from torch import Tensor
 
 from dsar.network import NetworkOutput
 
-MARGIN = 1.5
-"""How many times training's largest a value may be (field study 9.4)."""
+FAR_MARGIN = 1.5
+"""How many times training's farthest frame a frame may be from its mean until a warning (field study 9.4)."""
+BREAKING_MARGIN = 3.0
+"""How many times training's largest an output may be until it is replaced. Sound frames of unseen motions
+reach 2.4 (a wool skirt in a squat); what feeds on itself passes any number."""
 JITTER_SECONDS = 0.25
 """Time constant of the mean of the jitter: one sharp step is no trembling."""
 

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from dsar.avatar.guard_limits import MARGIN, GuardLimits, Jitter
+from dsar.avatar.guard_limits import BREAKING_MARGIN, FAR_MARGIN, GuardLimits, Jitter
 from dsar.avatar.guards import Guard
 from dsar.network import NetworkOutput
 from dsar.types import GuardedFrame
@@ -85,7 +85,7 @@ class Watchdog:
         if found.keys() & REPLACING:
             output = pose_only.restart()
             # A number that is none is within no limit.
-            if not float(self.limits.size(output)) <= MARGIN:
+            if not float(self.limits.size(output)) <= BREAKING_MARGIN:
                 output = pose_only.template()
             # The step to a sound frame is no trembling of it.
             held, jitter = 1 - self._step, self._beginning.jitter.step(output.offset.clone(), 0.0)
@@ -114,7 +114,11 @@ class Watchdog:
             found |= {Guard.SIZE: size, Guard.JITTER: jitter.size / self.limits.jitter}
         else:
             found[Guard.FINITE] = math.inf
-        return {guard: value for guard, value in found.items() if value > MARGIN}, jitter
+        margins = {Guard.FAR: FAR_MARGIN}
+        beyond = {
+            guard: value for guard, value in found.items() if value > margins.get(guard, BREAKING_MARGIN)
+        }
+        return beyond, jitter
 
 
 def _blend(output: NetworkOutput, before: NetworkOutput, share: float) -> NetworkOutput:

@@ -74,6 +74,7 @@ def write_report(run: Run) -> Path:
         "splits": [(name, *(values.get(key) for key in metrics)) for name, values in splits.items()],
         "unseen": list(_unseen_tables((figures or {}).get("unseen") or {})),
         "battery": battery,
+        "moments": _moments(run, battery) if battery else {},
         "stability": _draw_stability(battery) if battery else "",
         "study": study,
         "charts": list(_draw_study(study["tables"], figures)) if study else [],
@@ -101,9 +102,20 @@ def _previews(run: Run) -> Iterator[dict[str, Any]]:
     for name, title, note in _PREVIEWS:
         path = run.previews / name
         if path.exists():
-            kind = mimetypes.guess_type(name)[0] or ""
-            data = f"data:{kind};base64,{base64.b64encode(path.read_bytes()).decode()}"
-            yield {"title": title, "note": note, "data": data, "video": kind.startswith("video")}
+            data = _embed(path)
+            yield {"title": title, "note": note, "data": data, "video": data.startswith("data:video")}
+
+
+def _moments(run: Run, battery: Mapping[str, Any]) -> dict[str, str]:
+    """Return the pictures of the worst moment of each case that has some."""
+    paths = {case: run.stress_pictures / f"{case}.png" for case in battery["cases"]}
+    return {case: _embed(path) for case, path in paths.items() if path.exists()}
+
+
+def _embed(path: Path) -> str:
+    """Return a picture or a video as what a page carries itself."""
+    kind = mimetypes.guess_type(path.name)[0] or ""
+    return f"data:{kind};base64,{base64.b64encode(path.read_bytes()).decode()}"
 
 
 def _unseen_tables(unseen: Mapping[str, Any]) -> Iterator[dict[str, Any]]:

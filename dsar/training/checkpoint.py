@@ -80,6 +80,11 @@ class Run:
         return self.folder / "stress.json"
 
     @property
+    def stress_pictures(self) -> Path:
+        """Folder of the worst moment of each of its cases."""
+        return self.previews / "stress"
+
+    @property
     def study(self) -> Path:
         """The tables of the models beside it, where `dsar eval` made some (`runs/study/study.json`)."""
         own, near = self.folder.parent / "study.json", self.folder.parent / "study" / "study.json"

@@ -32,6 +32,15 @@ def command(*arguments):
     main([*map(str, arguments), "--progress", "none"])
 
 
+def exit_code(*arguments) -> int:
+    """Return the code with which a command ends."""
+    try:
+        command(*arguments)
+    except SystemExit as stop:
+        return int(stop.code)
+    return 0
+
+
 def failure(capsys, *arguments) -> str:
     with pytest.raises(SystemExit) as stop:
         command(*arguments)
@@ -195,7 +204,7 @@ class Page(HTMLParser):
             self.words += data
 
 
-def test_a_run_has_a_report_that_needs_nothing_else(trained, tmp_path, monkeypatch):
+def test_a_run_has_a_report_that_needs_nothing_else(trained, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("dsar.evaluation.stress.CASES", {"causal": run_causal, "stop": run_stop})
     run = tmp_path / "<run> & more"
     shutil.copytree(trained, run)
@@ -209,18 +218,27 @@ def test_a_run_has_a_report_that_needs_nothing_else(trained, tmp_path, monkeypat
     assert "model.window" in page.words, "settings that differ from the preset's"
 
     command("eval", run, "--json", tmp_path / "eval.json")
-    command("stress", run, "--json", tmp_path / "stress.json")
+    code = exit_code("stress", run, "--json", tmp_path / "stress.json")
     figures, battery = (json.loads((tmp_path / f"{name}.json").read_text()) for name in ("eval", "stress"))
     assert figures == json.loads((run / "figures.json").read_text())
     assert set(battery["cases"]) == {"causal", "stop"}
     assert battery["tried"] == 2
     assert battery["survived"] == sum(case["pass"] for case in battery["cases"].values())
+    assert code == int(battery["survived"] < battery["tried"])
+    assert battery["analysis"]["lyapunov_per_s"]
     page = Page((run / "report.html").read_text())
     assert page.asked == []
     assert "Not measured yet" not in page.words
+    shown = " ".join(page.words.split())
+    assert all(" ".join(case["reason"].split()) in shown for case in battery["cases"].values())
+    assert "Lyapunov exponent" in shown
+    before = (run / "stress.json").read_bytes()
+    assert exit_code("stress", run, "--cases", "causal") == 0
+    assert (run / "stress.json").read_bytes() == before
+    assert "--cases: no case dance" in failure(capsys, "stress", run, "--cases", "dance")
     assert f"{figures['splits']['test']['psnr_box']:.4g}" in page.words
     kinds = [each.partition(";")[0] for each in page.carried]
-    assert sorted(kinds) == ["data:image/png", "data:image/png", "data:video/mp4"]
+    assert sorted(kinds) == ["data:image/png"] * 4 + ["data:video/mp4"], "two are of the cases' worst moments"
     worst = figures["worst"]
     assert [view["psnr_box"] for view in worst] == sorted(view["psnr_box"] for view in worst)
     assert len({(view["sequence"], view["frame"]) for view in worst}) == len(worst)

@@ -15,7 +15,7 @@ import dsar
 from dsar.avatar import driving
 from dsar.avatar.avatar import Avatar
 from dsar.avatar.charts import Atlas, body_chart
-from dsar.avatar.guard_limits import MARGIN, GuardLimits, Jitter
+from dsar.avatar.guard_limits import BREAKING_MARGIN, GuardLimits, Jitter
 from dsar.avatar.guards import Guard
 from dsar.avatar.player import Player
 from dsar.avatar.rollout import roll_out
@@ -115,7 +115,7 @@ def test_the_farthest_training_frame_is_at_one(avatar):
 
 
 def test_a_rollout_that_grows_is_caught_and_stays_within_training(avatar):
-    limit = MARGIN * avatar.guard_limits.offset
+    limit = BREAKING_MARGIN * avatar.guard_limits.offset
     break_weight(avatar, 8.0)
     bare, _ = play(avatar, sway(), guarded=False)
     offsets, found = play(avatar, sway())
@@ -123,7 +123,7 @@ def test_a_rollout_that_grows_is_caught_and_stays_within_training(avatar):
     assert offsets.abs().amax() <= limit * (1 + 1e-6)
     caught = [frame for frame in found if frame is not None and Guard.SIZE in frame.exceeded]
     assert caught
-    assert all(frame.exceeded[Guard.SIZE] > MARGIN for frame in caught)
+    assert all(frame.exceeded[Guard.SIZE] > BREAKING_MARGIN for frame in caught)
 
 
 def test_what_feedback_alone_makes_grow_follows_from_the_pose(avatar):
@@ -131,11 +131,11 @@ def test_what_feedback_alone_makes_grow_follows_from_the_pose(avatar):
     limits = dataclasses.replace(avatar.guard_limits, offset=1.0)
     first, _ = play(avatar, sway(1), guarded=False)
     rest, _ = play(avatar, sway(), guarded=False)
-    limit = 0.5 * float(first.abs().amax() + rest.abs().amax()) / MARGIN
+    limit = 0.5 * float(first.abs().amax() + rest.abs().amax()) / BREAKING_MARGIN
     avatar.guard_limits = dataclasses.replace(limits, offset=limit, appearance=1e3, jitter=1e3)
     offsets, found = play(avatar, sway())
     assert any(Guard.SIZE in each for each in names(found))
-    assert offsets.abs().amax() <= MARGIN * limit * (1 + 1e-6)
+    assert offsets.abs().amax() <= BREAKING_MARGIN * limit * (1 + 1e-6)
 
 
 def test_weights_that_are_no_numbers_leave_the_skinned_template(avatar):

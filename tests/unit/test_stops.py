@@ -8,7 +8,7 @@ import torch
 from dsar.body.files import load_body
 from dsar.body.skinning import forward_kinematics
 from dsar.evaluation.stops import find_stops, measure_stop
-from dsar.evaluation.stress_motions import spin_and_stop, sway_motion
+from dsar.evaluation.stress.motions import spin_and_stop, sway_motion
 from tests.loose_cloth import FPS, striding
 
 
