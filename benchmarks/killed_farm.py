@@ -48,7 +48,7 @@ def main() -> None:
             print(f"{shots} shots, {kills} kills, {'equal' if equal else 'DIFFERENT'}", flush=True)
     found = {"images": len(expected), "shots": shots, "kills": kills, "equal": equal, "minutes": args.minutes}
     if args.json:
-        write_json(args.json, {"machine": describe_machine(), **found})
+        write_json({"machine": describe_machine(), **found}, args.json)
     if not equal:
         sys.exit(1)
 

@@ -49,7 +49,7 @@ def main() -> None:
         f"frames; largest offset {found['largest_m']:.3f} m; memory +{found['memory_growth_mib']:.0f} MiB"
     )
     if args.json:
-        write_json(args.json, {"machine": describe_machine(), **found})
+        write_json({"machine": describe_machine(), **found}, args.json)
 
 
 @torch.no_grad()

@@ -33,32 +33,35 @@ def image_losses(
         lpips: The network of LPIPS, where it is used.
     """
     fused = images[0].color.dtype == torch.float32 and takes_kernels(images[0].color)
-    return (_one_by_one if fused else _together)(images, targets, backgrounds, config, lpips)
+    compare = _compare_one_by_one if fused else _compare_together
+    losses, errors, truths = compare(images, targets, backgrounds, config)
+    if lpips is not None:
+        distances = [_perceptual(i.color, truth, lpips) for i, truth in zip(images, truths, strict=True)]
+        losses = losses + config.lpips * torch.stack(distances)
+    return losses, errors
 
 
-def _one_by_one(
-    images: Sequence[RenderOutput],
-    targets: Sequence[Target],
-    backgrounds: Float[Tensor, "v 3"],
-    config: LossConfig,
-    lpips: torch.nn.Module | None,
-) -> tuple[Float[Tensor, " v"], Float[Tensor, " v"]]:
-    weights, losses, errors = (config.l1, config.ssim, config.alpha), [], []
+_Compared = tuple[Float[Tensor, " v"], Float[Tensor, " v"], list[Float[Tensor, "_ _ 3"]]]
+"""Losses without LPIPS, squared errors, and the truths over their backgrounds."""
+
+
+def _compare_one_by_one(
+    images: Sequence[RenderOutput], targets: Sequence[Target], backgrounds: Tensor, config: LossConfig
+) -> _Compared:
+    weights, losses, errors, truths = (config.l1, config.ssim, config.alpha), [], [], []
     for image, target, background in zip(images, targets, backgrounds, strict=True):
         truth = target.color + (1 - target.alpha[..., None]) * background
-        loss = fused_image_loss(image.color, image.alpha, truth, target.alpha, config.pyramid, weights)
-        losses.append(loss if lpips is None else loss + config.lpips * _perceptual(image.color, truth, lpips))
+        losses.append(
+            fused_image_loss(image.color, image.alpha, truth, target.alpha, config.pyramid, weights)
+        )
         errors.append((image.color - truth).detach().square().mean())
-    return torch.stack(losses), torch.stack(errors)
+        truths.append(truth)
+    return torch.stack(losses), torch.stack(errors), truths
 
 
-def _together(
-    images: Sequence[RenderOutput],
-    targets: Sequence[Target],
-    backgrounds: Float[Tensor, "v 3"],
-    config: LossConfig,
-    lpips: torch.nn.Module | None,
-) -> tuple[Float[Tensor, " v"], Float[Tensor, " v"]]:
+def _compare_together(
+    images: Sequence[RenderOutput], targets: Sequence[Target], backgrounds: Tensor, config: LossConfig
+) -> _Compared:
     sizes = [(target.alpha.shape[0], target.alpha.shape[1]) for target in targets]
     padding = Padding.of(sizes, config.pyramid, backgrounds.device)
     drawn = [torch.cat([image.color.flatten(0, 1) for image in images])]
@@ -71,11 +74,8 @@ def _together(
     truths = torch.cat([truths[:, :3] + free * backgrounds[:, :, None, None], truths[:, 3:]], 1)
     weights = config.l1, config.ssim, config.alpha
     losses, errors = padded_losses(colors, truths, padding, config.pyramid, weights)
-    if lpips is not None:
-        cut = [image[:3, :h, :w].permute(1, 2, 0) for image, (h, w) in zip(truths, sizes, strict=True)]
-        distances = [_perceptual(i.color, truth, lpips) for i, truth in zip(images, cut, strict=True)]
-        losses = losses + config.lpips * torch.stack(distances)
-    return losses, errors
+    cut = [image[:3, :h, :w].permute(1, 2, 0) for image, (h, w) in zip(truths, sizes, strict=True)]
+    return losses, errors, cut
 
 
 def _perceptual(
