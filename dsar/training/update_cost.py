@@ -89,6 +89,8 @@ _SCHEDULE = (
     *("muon_rate", "recomputation"),
 )
 """Settings of the schedule that an update's cost depends on."""
+MOST_IMITATED = 64
+"""Rollouts of the largest batch that is imitated, view by view."""
 
 
 class _ImitatedUpdate:
@@ -258,12 +260,35 @@ def estimate_pairs(gaussians: int, view: tuple[int, int]) -> int:
 
 
 def cost_of_update(config: TrainConfig, view: tuple[int, int]) -> UpdateCost:
-    """Return what an update of these settings costs one worker, on views of a height and width in pixels."""
+    """Return what an update of these settings costs one worker, on views of a height and width in pixels.
+
+    Of many rollouts two smaller batches are imitated: memory grows by as much with each rollout.
+    """
     schedule = {name: getattr(config.schedule, name) for name in _SCHEDULE}
     what_counts = TrainConfig(
         atlas=config.atlas, model=config.model, loss=config.loss, schedule=ScheduleConfig(**schedule)
     )
-    return _imitated(what_counts, view)
+    rollouts = config.schedule.rollouts_per_worker
+    if rollouts <= MOST_IMITATED:
+        return _imitated(what_counts, view)
+    half, whole = (
+        _imitated(_with_rollouts(what_counts, count), view) for count in (MOST_IMITATED // 2, MOST_IMITATED)
+    )
+    more, times = rollouts / MOST_IMITATED - 1, rollouts / MOST_IMITATED
+    memory = {
+        part: size + round(2 * more * (size - half.memory.get(part, 0)))
+        for part, size in whole.memory.items()
+    }
+    operations = (
+        dataclasses.replace(o, flop=round(times * o.flop), traffic=round(times * o.traffic))
+        for o in whole.operations
+    )
+    return UpdateCost(whole.parameters, memory, tuple(operations))
+
+
+def _with_rollouts(config: TrainConfig, count: int) -> TrainConfig:
+    schedule = dataclasses.replace(config.schedule, rollouts_per_worker=count)
+    return dataclasses.replace(config, schedule=schedule)
 
 
 @lru_cache(maxsize=64)

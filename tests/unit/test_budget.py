@@ -11,7 +11,7 @@ from dsar.cli import main
 from dsar.config import PRESETS, AtlasConfig, ModelConfig, ScheduleConfig, TrainConfig
 from dsar.errors import ConfigError
 from dsar.network import build_network
-from dsar.training import budget
+from dsar.training import budget, update_cost
 from dsar.training.budget import Room
 from dsar.training.checkpoint import Run
 from dsar.training.device_rates import DeviceRates, measure_rates
@@ -70,6 +70,16 @@ def chunk(network, config, frames):
             loss = loss + output.offset.square().sum() + output.appearance.square().sum()
     weights = {p.untyped_storage().data_ptr() for p in network.parameters()}
     return loss, sum(size for place, size in saved.items() if place not in weights)
+
+
+def test_what_many_rollouts_cost_follows_from_fewer(monkeypatch):
+    config = with_schedule(SMALL, rollouts_per_worker=48)
+    whole = cost_of_update(config, (32, 32))
+    monkeypatch.setattr(update_cost, "MOST_IMITATED", 16)
+    reckoned = cost_of_update(config, (32, 32))
+    assert reckoned.total_memory == pytest.approx(whole.total_memory, rel=0.02)
+    assert reckoned.network_flop == pytest.approx(whole.network_flop, rel=0.02)
+    assert reckoned.parameters == whole.parameters
 
 
 @pytest.mark.parametrize("wiring", ["shared", "late", "perframe"])
