@@ -34,7 +34,7 @@ class Stress(GuardedCommand):
         from dsar.atomic_files import write_text_atomically
         from dsar.evaluation.report import write_report
         from dsar.evaluation.stress import CASES, BatteryVerdict, stress
-        from dsar.evaluation.stress.analysis import analyse, describe_analysis
+        from dsar.evaluation.stress.analysis import analyse, describe_analysis, reported_motions
         from dsar.training.checkpoint import Run, load_checkpoint
         from dsar.training.scene import open_scene
 
@@ -62,8 +62,7 @@ class Stress(GuardedCommand):
         battery = BatteryVerdict(cases, seconds)
         content = battery.to_json()
         if not self.cases:
-            names = [*scene.splits["test"], *scene.splits.get("unseen_test", ())]
-            analysis = analyse(avatar, motion, {name: scene.motions[name] for name in names})
+            analysis = analyse(avatar, motion, reported_motions(scene))
             content |= {"analysis": analysis.to_json()}
             for line in describe_analysis(analysis):
                 sys.stdout.write(line + "\n")

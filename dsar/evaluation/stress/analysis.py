@@ -25,7 +25,9 @@ from dsar.evaluation.stress.rollouts import (
     rms_distance,
     roll_offsets,
 )
+from dsar.evaluation.unseen import SPLITS
 from dsar.network import NetworkState
+from dsar.training.scene import Scene
 from dsar.types import Motion
 
 NUDGE = 1e-3
@@ -77,6 +79,12 @@ class Analysis:
             "settle_s": _finite(self.settle),
             "overshoot_mm": _finite(self.overshoot),
         }
+
+
+def reported_motions(scene: Scene) -> dict[str, Motion]:
+    """Return the motions that figures are reported on, by name: nothing is chosen by them."""
+    names = [*scene.splits["test"], *scene.splits.get(SPLITS["test"], ())]
+    return {name: scene.motions[name] for name in names}
 
 
 def analyse(avatar: Avatar, motion: Motion, tests: Mapping[str, Motion]) -> Analysis:
